@@ -1,0 +1,163 @@
+"""A neural network policy as a controller, and its file: plain arrays and a JSON header."""
+
+import dataclasses
+import io
+import itertools
+import json
+import os
+import zipfile
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._struct import pytree, static
+from ..designs import ROBOTS, active_joint
+from ..errors import JaxpendError, choose
+from ..observation import Observation
+
+__all__ = ["ACTIVATIONS", "Policy", "load_policy", "save_policy"]
+
+FORMAT = 1
+ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "silu": jax.nn.silu}
+
+
+@pytree
+class Policy:
+    """Multi-layer perceptron from an observation of the state to the driven joint's torque.
+
+    ``action_noise`` is the standard deviation of the noise added to the action before the tanh
+    (SNES trains with it); None means greedy and costs nothing.
+    """
+
+    layers: tuple[tuple[jax.Array, jax.Array], ...]  # (kernel (in, out), bias (out,)) each
+    torque_limit: jax.Array  # () N m, torque at action 1
+    action_noise: jax.Array | None = None  # ()
+    robot: str = static(default="pendubot")
+    observation: Observation = static(default=Observation())
+    activation: str = static(default="relu")
+    control_dt: float = static(default=0.01)  # s, the period it was trained at
+
+    def pre_action(self, x: jax.Array) -> jax.Array:
+        """The action before the tanh, scalar, for a measured state (4,)."""
+        h = self.observation(x)
+        *hidden, (kernel, bias) = self.layers
+        for w, b in hidden:
+            h = ACTIVATIONS[self.activation](h @ w + b)
+        return (h @ kernel + bias)[0]
+
+    def reset(self, key: jax.Array) -> jax.Array | None:
+        """The key for the action noise, or nothing."""
+        return None if self.action_noise is None else key
+
+    def __call__(self, carry, t, x):
+        """Torque (2,), N m, zero on the passive joint."""
+        pre = self.pre_action(x)
+        if self.action_noise is not None:
+            carry, key = jax.random.split(carry)
+            pre = pre + self.action_noise * jax.random.normal(key, (), pre.dtype)
+        torque = self.torque_limit * jnp.tanh(pre)
+        on_joint = np.arange(2) == active_joint(self.robot)
+        return carry, jnp.where(on_joint, torque, jnp.zeros_like(torque))
+
+
+def _header(policy: Policy, provenance: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "robot": policy.robot,
+        "torque_limit": float(policy.torque_limit),
+        "observation": dataclasses.asdict(policy.observation),
+        "activation": policy.activation,
+        "layers": [policy.layers[0][0].shape[0], *(int(b.shape[0]) for _, b in policy.layers)],
+        "control_dt": policy.control_dt,
+        "provenance": provenance,
+    }
+
+
+def save_policy(path: str | Path, policy: Policy, provenance: dict[str, Any] | None = None) -> None:
+    """Write a policy file (.npz without pickle: float32 arrays and a JSON header), atomically.
+
+    ``provenance`` is any JSON object: command, seed, scores, ...
+    """
+    arrays = {"header": np.array(json.dumps(_header(policy, provenance or {})))}
+    for i, (kernel, bias) in enumerate(policy.layers):
+        arrays |= {f"kernel{i}": np.asarray(kernel, "f4"), f"bias{i}": np.asarray(bias, "f4")}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    write_atomically(path, buffer.getvalue())
+
+
+def write_atomically(path: str | Path, content: bytes | str) -> None:
+    """Write a file so that a reader, or a crash, sees the old content or the new, whole."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+    os.replace(temporary, path)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        header = json.loads(str(arrays.pop("header")))
+    except FileNotFoundError:
+        raise JaxpendError(f"there is no policy file {path}") from None
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+        raise JaxpendError(f"{path} is not a policy file, or it is empty or cut off") from None
+    if header.get("format") != FORMAT:
+        raise JaxpendError(f"{path} has policy format {header.get('format')}; this reads {FORMAT}")
+    return header, arrays
+
+
+def read_header(robot_or_path: str | Path) -> dict[str, Any]:
+    """The JSON header of a policy file. Raises ``JaxpendError`` as ``load_policy``."""
+    return _read(_locate(robot_or_path))[0]
+
+
+def _locate(robot_or_path: str | Path) -> Path:
+    if str(robot_or_path) not in ROBOTS:
+        return Path(robot_or_path)
+    return Path(str(resources.files("jaxpend").joinpath(f"policies/{robot_or_path}.npz")))
+
+
+def load_policy(robot_or_path: str | Path, *, robot: str | None = None) -> Policy:
+    """Load a policy file, or by "acrobot" / "pendubot" the policy that ships with the package.
+
+    Args:
+        robot_or_path: a path, or the name of a robot.
+        robot: the robot that the policy must be for; None accepts either.
+
+    Raises:
+        JaxpendError: no such file, not a policy file, or the policy of the other robot.
+    """
+    path = _locate(robot_or_path)
+    header, arrays = _read(path)
+    try:
+        sizes = header["layers"]
+        layers = tuple(
+            (jnp.asarray(arrays[f"kernel{i}"]), jnp.asarray(arrays[f"bias{i}"]))
+            for i in range(len(sizes) - 1)
+        )
+        policy = Policy(
+            layers=layers,
+            torque_limit=jnp.asarray(header["torque_limit"], jnp.float32),
+            robot=choose("robot", header["robot"], ROBOTS),
+            observation=Observation(**header["observation"]),
+            activation=choose("activation", header["activation"], ACTIVATIONS),
+            control_dt=float(header["control_dt"]),
+        )
+        shapes = [(k.shape, b.shape) for k, b in layers]
+    except (KeyError, TypeError) as error:
+        raise JaxpendError(f"{path} lacks a part of a policy: {error}") from None
+    expected = [((a, b), (b,)) for a, b in itertools.pairwise(sizes)]
+    if shapes != expected or sizes[0] != policy.observation.size or sizes[-1] != 1:
+        raise JaxpendError(f"{path}: the arrays do not have the shapes that its header says")
+    if not all(np.isfinite(a).all() for a in arrays.values()) or not policy.torque_limit > 0:
+        raise JaxpendError(f"{path}: the policy holds values that are not finite or not positive")
+    if robot is not None and policy.robot != choose("robot", robot, ROBOTS):
+        raise JaxpendError(f"{path} is a policy for the {policy.robot}, not for the {robot}")
+    return policy

@@ -1,0 +1,133 @@
+"""Identified parameter sets of the RealAIGym double pendulums, and a user's own.
+
+The numbers in ``models.json`` are the identified parameters published with the RealAIGym
+``double_pendulum`` project (designs A.0, C.0 and C.1; BSD 3-Clause), carried over as facts.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import JaxpendError, choose
+from ..plant import Plant
+
+__all__ = ["ROBOTS", "active_joint", "available", "competition", "from_dict", "from_file", "load"]
+
+# Driven joint of each robot.
+ROBOTS = {"acrobot": 1, "pendubot": 0}
+_REQUIRED = ("m1", "m2", "l1", "l2", "r1", "r2", "I1", "I2")
+_OPTIONAL = {
+    "b1": 0.0, "b2": 0.0, "cf1": 0.0, "cf2": 0.0, "tl1": math.inf, "tl2": math.inf,
+    "g": 9.81, "Ir": 0.0, "gr": 6.0,
+}  # fmt: skip
+_POSITIVE = ("m1", "m2", "l1", "l2", "r1", "r2", "I1", "I2", "gr")
+
+
+def _table() -> dict[str, dict[str, dict[str, float]]]:
+    return json.loads(resources.files(__package__).joinpath("models.json").read_text())
+
+
+def available() -> list[str]:
+    """The known parameter sets, as ``"C.1/1.0"``."""
+    return [f"{design}/{model}" for design, models in _table().items() for model in models]
+
+
+def active_joint(robot: str) -> int:
+    """Index of the driven joint: 1 for the acrobot, 0 for the pendubot.
+
+    Raises ``JaxpendError`` for an unknown robot.
+    """
+    return ROBOTS[choose("robot", robot, ROBOTS)]
+
+
+def from_dict(
+    parameters: Mapping[str, float], *, robot: str | None = None, torque_limit: float | None = None
+) -> Plant:
+    """Build a plant from the field names that RealAIGym uses.
+
+    Args:
+        parameters: ``m1 m2 l1 l2 r1 r2 I1 I2`` (kg, m, kg m^2 about the joint; required) and
+            ``b1 b2 cf1 cf2 tl1 tl2 g Ir gr`` (N m s/rad, N m, N m, m/s^2, kg m^2, -).
+        robot: "acrobot" or "pendubot" masks the passive joint in ``actuation`` and zeroes its
+            torque limit; None leaves both joints driven.
+        torque_limit: limit of the driven joint in N m, in place of ``tl1``/``tl2``.
+
+    Raises:
+        JaxpendError: missing, unknown, non-finite or non-positive parameters.
+    """
+    if not isinstance(parameters, Mapping):
+        raise JaxpendError("plant parameters must be a mapping such as {m1: 0.5, l1: 0.2, ...}")
+    if missing := [k for k in _REQUIRED if k not in parameters]:
+        raise JaxpendError(f"plant parameters lack {', '.join(missing)}")
+    for key in parameters:
+        choose("plant parameter", key, (*_REQUIRED, *_OPTIONAL))
+    try:
+        p = {k: float(v) for k, v in {**_OPTIONAL, **parameters}.items()}
+    except (TypeError, ValueError) as error:
+        raise JaxpendError(f"plant parameters must be numbers: {error}") from None
+    for key, value in p.items():
+        if math.isnan(value) or (math.isinf(value) and not key.startswith("tl")):
+            raise JaxpendError(f"plant parameter {key} is {value}; it must be finite")
+        if key in _POSITIVE and value <= 0:
+            raise JaxpendError(f"plant parameter {key} is {value}; it must be positive")
+        if key.startswith("tl") and value < 0:
+            raise JaxpendError(f"torque limit {key} is {value} N m; it must not be negative")
+    limit, actuation = np.array([p["tl1"], p["tl2"]]), np.ones(2)
+    if robot is not None:
+        actuation = np.arange(2) == active_joint(robot)
+        limit = np.where(actuation, limit, 0.0)
+    if torque_limit is not None:
+        if not torque_limit > 0:
+            raise JaxpendError(f"torque limit is {torque_limit} N m; it must be positive")
+        limit = np.where(actuation, torque_limit, 0.0)
+    pair = lambda name: np.array([p[name + "1"], p[name + "2"]])  # noqa: E731
+    values = Plant(
+        mass=pair("m"), length=pair("l"), com=pair("r"), inertia=pair("I"), damping=pair("b"),
+        coulomb_friction=pair("cf"), torque_limit=limit, actuation=np.asarray(actuation, float),
+        gravity=np.array(p["g"]), motor_inertia=np.array(p["Ir"]), gear_ratio=np.array(p["gr"]),
+    )  # fmt: skip
+    return Plant(**{k: jnp.asarray(v, jnp.result_type(float)) for k, v in vars(values).items()})
+
+
+def from_file(path: str | Path, **kwargs) -> Plant:
+    """``from_dict`` on a YAML (or JSON) file. Raises ``JaxpendError`` if it cannot be read."""
+    import yaml  # only users with files of their own pay for it
+
+    try:
+        parameters = yaml.safe_load(Path(path).read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = getattr(error, "strerror", None) or "not valid YAML"
+        raise JaxpendError(f"cannot read plant parameters from {path}: {reason}") from None
+    return from_dict(parameters, **kwargs)
+
+
+def load(
+    design: str, model: str, *, robot: str | None = None, torque_limit: float | None = None
+) -> Plant:
+    """An identified parameter set by name, such as ``load("C.1", "1.0")``.
+
+    ``robot`` and ``torque_limit`` are as in ``from_dict``. The arrays have jax's default float
+    type at the time of the call: float64 under ``jax.enable_x64``, else float32.
+
+    Raises:
+        JaxpendError: unknown design or model; the message lists the known ones.
+    """
+    table = _table()
+    models = table[choose("design", str(design).removeprefix("design_"), table)]
+    model = choose(f"model of design {design}", str(model).removeprefix("model_"), models)
+    return from_dict(models[model], robot=robot, torque_limit=torque_limit)
+
+
+def competition(robot: str, torque_limit: float = 6.0) -> Plant:
+    """The plant of the v2 boards: design C.1 model 1.0 without friction and motor inertia.
+
+    The passive joint is masked and the driven one limited to ``torque_limit`` N m. The boards
+    run it at dt = 0.002 s for 10 s from (0, 0, 0, 0), the defaults of ``rollout``.
+    """
+    parameters = _table()["C.1"]["1.0"] | dict.fromkeys(("b1", "b2", "cf1", "cf2", "Ir"), 0.0)
+    return from_dict(parameters, robot=robot, torque_limit=torque_limit)

@@ -1,0 +1,69 @@
+"""What a policy sees of the state. One definition for training, rollouts and policy files."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from .errors import JaxpendError, choose
+
+__all__ = ["OBSERVATIONS", "Observation"]
+
+
+def _wrapped(x: jax.Array, max_velocity: float) -> jax.Array:
+    """Angles mod 2 pi on [-1, 1] and clipped velocities, as Evolutionary SAC has them.
+
+    ``theta1 = pi`` maps to 0, but ``theta2 = 0``, the goal, lies on the wrap from 1 to -1.
+    """
+    angles = (x[:2] % (2 * jnp.pi) - jnp.pi) / jnp.pi
+    return jnp.concatenate([angles, jnp.clip(x[2:4] / max_velocity, -1.0, 1.0)])
+
+
+def _sincos(x: jax.Array, max_velocity: float) -> jax.Array:
+    """Cosine and sine of both angles and scaled velocities: no jump anywhere."""
+    angles, velocity = x[:2], x[2:4]
+    return jnp.concatenate([jnp.cos(angles), jnp.sin(angles), velocity / max_velocity])
+
+
+def _fine(x: jax.Array, max_velocity: float) -> jax.Array:
+    """``sincos`` plus a magnified view of the upright state.
+
+    Balancing happens within 0.1 rad and 1 rad/s of upright, a few percent of what ``sincos``
+    spans. The added terms resolve it and saturate elsewhere.
+    """
+    link2 = x[0] + x[1]
+    tilt = jnp.stack([-jnp.sin(x[0]), -jnp.sin(link2), jnp.sin(x[1])])
+    return jnp.concatenate([_sincos(x, max_velocity), jnp.tanh(4 * tilt), jnp.tanh(x[2:4] / 2)])
+
+
+OBSERVATIONS: dict[str, tuple[Callable, int]] = {
+    "wrapped": (_wrapped, 4),
+    "sincos": (_sincos, 6),
+    "fine": (_fine, 11),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Observation:
+    """How a state (4,) becomes an observation (``size``,).
+
+    Raises ``JaxpendError`` for an unknown kind or a velocity scale that is not positive.
+    """
+
+    kind: str = "sincos"
+    max_velocity: float = 20.0  # rad/s, velocities are divided by it
+
+    def __post_init__(self):
+        choose("observation kind", self.kind, OBSERVATIONS)
+        if not self.max_velocity > 0:
+            raise JaxpendError(f"max_velocity is {self.max_velocity} rad/s; it must be positive")
+
+    @property
+    def size(self) -> int:
+        """Length of the observation."""
+        return OBSERVATIONS[self.kind][1]
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Observation of one state."""
+        return OBSERVATIONS[self.kind][0](x, self.max_velocity)

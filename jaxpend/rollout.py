@@ -1,0 +1,184 @@
+"""The closed loop: one ``lax.scan`` of a controller on a scenario. Nothing else simulates."""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ._struct import pytree
+from .controllers.base import Controller
+from .errors import JaxpendError
+from .plant import Plant, rk4_step
+from .scenario import Scenario
+
+__all__ = ["Trajectory", "final_state", "rollout", "time_stamps"]
+
+# Standard normals of one step, in the order of the reference simulator.
+NOISE = {"measurement": slice(0, 4), "torque": slice(4, 6), "process": slice(6, 10)}
+
+
+@pytree
+class Trajectory:
+    """One closed-loop run of N steps. A leading batch axis comes from ``jax.vmap``."""
+
+    t: jax.Array  # (N + 1,) s
+    x: jax.Array  # (N + 1, 4) true state
+    u: jax.Array  # (N, 2) N m, applied over [t[k], t[k + 1]]
+    x_measured: jax.Array  # (N, 4) what the controller saw
+    u_command: jax.Array  # (N, 2) N m, what the controller asked for
+
+
+def time_stamps(dt: float, duration: float) -> np.ndarray:
+    """Time stamps of the reference simulator: the running float64 sum of ``dt``, (N + 1,), s.
+
+    It steps while ``t < duration``: 10 s at 0.002 s are 5000 steps, the last stamp being
+    10.000000000000009. Raises ``JaxpendError`` unless both are positive and finite.
+    """
+    if not (0 < dt < np.inf and 0 < duration < np.inf):
+        raise JaxpendError(f"dt = {dt} s and duration = {duration} s must be positive and finite")
+    t = np.concatenate([[0.0], np.cumsum(np.full(int(duration / dt) + 2, dt))])
+    return t[: int(np.argmax(t >= duration)) + 1]
+
+
+def _measure(scenario: Scenario, history, k, x, z):
+    """Delayed and noisy measurement; returns it with the updated ring buffer of past states."""
+    measured = x
+    if scenario.delay is not None:
+        slots = history.shape[0]
+        history = jax.lax.dynamic_update_slice_in_dim(history, x[None], k % slots, 0)
+        lagged = jnp.maximum(k - scenario.delay, 0) % slots
+        measured = jnp.take_along_axis(history, lagged[None], axis=0)[0]
+    if scenario.measurement_noise is not None:
+        measured = measured + scenario.measurement_noise * z[NOISE["measurement"]]
+    return history, measured
+
+
+def _actuate(scenario: Scenario, command, applied_before, t_pulse, z):
+    """Torque that reaches the joints: response, noise, limit, disturbance, in this order."""
+    u = command
+    if scenario.responsiveness is not None:
+        u = applied_before + scenario.responsiveness * (u - applied_before)
+    if scenario.torque_noise is not None:
+        u = u + scenario.torque_noise * z[NOISE["torque"]]
+    limit = scenario.plant.torque_limit
+    u = jnp.clip(u, -limit, limit)
+    if scenario.pulses is not None:
+        u = u + scenario.pulses.torque(t_pulse)
+    return u
+
+
+def _closed_loop(scenario, controller, key, dt, duration, integrator, delay_slots, normals, record):
+    stamps = time_stamps(dt, duration)
+    steps = len(stamps) - 1
+    dtype = scenario.dtype
+    plant = scenario.plant
+    x0 = jnp.zeros(4, dtype) if scenario.x0 is None else jnp.asarray(scenario.x0, dtype)
+    noise_key, controller_key = jax.random.split(key)
+    is_noisy = any(
+        sigma is not None
+        for sigma in (scenario.measurement_noise, scenario.torque_noise, scenario.process_noise)
+    )
+    # The reference looks disturbances up at int(t / dt) of its drifting float time.
+    inputs = {
+        "k": np.arange(steps),
+        "t": stamps[:-1].astype(dtype),
+        "t_pulse": ((stamps[:-1] / dt).astype(int) * dt).astype(dtype),
+    }
+    if normals is not None:
+        inputs["z"] = jnp.asarray(normals, dtype)
+
+    def step(carry, now):
+        x, u, memory, history = carry
+        z = now.get("z")
+        if is_noisy and z is None:
+            z = jax.random.normal(jax.random.fold_in(noise_key, now["k"]), (10,), dtype)
+        history, measured = _measure(scenario, history, now["k"], x, z)
+        memory, command = controller(memory, now["t"], measured)
+        command = jnp.asarray(command, dtype)
+        u = _actuate(scenario, command, u, now["t_pulse"], z)
+        x_next = integrator(plant, x, u, dt)
+        if scenario.process_noise is not None:
+            x_next = x_next + scenario.process_noise * z[NOISE["process"]]
+        return (x_next, u, memory, history), (x, u, measured, command) if record else None
+
+    history = None if scenario.delay is None else jnp.broadcast_to(x0, (delay_slots, 4))
+    start = (x0, jnp.zeros(2, dtype), controller.reset(controller_key), history)
+    (x_end, *_), recorded = jax.lax.scan(step, start, inputs)
+    if not record:
+        return x_end
+    x, u, measured, command = recorded
+    x = jnp.concatenate([x, x_end[None]])
+    return Trajectory(jnp.asarray(stamps.astype(dtype)), x, u, measured, command)
+
+
+def _check(scenario: Scenario | Plant, delay_slots: int) -> Scenario:
+    scenario = Scenario(scenario) if isinstance(scenario, Plant) else scenario
+    delay = scenario.delay
+    if delay is not None and not isinstance(delay, jax.core.Tracer):
+        longest = int(np.max(delay))
+        if longest >= delay_slots:
+            raise JaxpendError(
+                f"a delay of {longest} steps does not fit in a buffer of {delay_slots} states; "
+                f"pass delay_slots={longest + 1} or more"
+            )
+    return scenario
+
+
+def rollout(
+    scenario: Scenario | Plant,
+    controller: Controller,
+    key: jax.Array,
+    *,
+    dt: float = 0.002,
+    duration: float = 10.0,
+    integrator: Callable = rk4_step,
+    delay_slots: int = 32,
+    normals: jax.Array | None = None,
+) -> Trajectory:
+    """Run a controller on a scenario; the order of a step is that of the reference simulator.
+
+    Pure: jit it, vmap it over scenarios, controllers and keys. A delay that is traced cannot be
+    checked against the buffer: give ``delay_slots`` more than the longest delay in steps.
+
+    Args:
+        scenario: one scenario, or a plant for the nominal one.
+        controller: any ``Controller``; it is called once a step, zero-order hold.
+        key: split once, for the scenario's noise and for ``controller.reset``.
+        dt: s, control and integration period.
+        duration: s.
+        integrator: ``rk4_step`` or ``euler_step``, or any function of the same form.
+        delay_slots: past states kept for delayed measurements.
+        normals: (N, 10) standard normals to use instead of drawing them: 4 measurement,
+            2 torque, 4 process.
+
+    Raises:
+        JaxpendError: dt or duration not positive, or a delay longer than the buffer.
+    """
+    scenario = _check(scenario, delay_slots)
+    return _closed_loop(
+        scenario, controller, key, dt, duration, integrator, delay_slots, normals, record=True
+    )
+
+
+@partial(jax.jit, static_argnames=("dt", "duration", "integrator", "delay_slots"))
+def _final_state(scenario, controller, key, dt, duration, integrator, delay_slots):
+    return _closed_loop(
+        scenario, controller, key, dt, duration, integrator, delay_slots, None, record=False
+    )
+
+
+def final_state(
+    scenario: Scenario | Plant,
+    controller: Controller,
+    key: jax.Array,
+    *,
+    dt: float = 0.002,
+    duration: float = 10.0,
+    integrator: Callable = rk4_step,
+    delay_slots: int = 32,
+) -> jax.Array:
+    """Only the last true state of ``rollout``, shape (4,): no trajectory is kept in memory."""
+    scenario = _check(scenario, delay_slots)
+    return _final_state(scenario, controller, key, dt, duration, integrator, delay_slots)
