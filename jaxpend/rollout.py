@@ -115,6 +115,11 @@ def _closed_loop(scenario, controller, key, dt, duration, integrator, delay_slot
 
 def _check(scenario: Scenario | Plant, delay_slots: int) -> Scenario:
     scenario = Scenario(scenario) if isinstance(scenario, Plant) else scenario
+    if scenario.x0 is not None and jnp.shape(scenario.x0) != (4,):
+        raise JaxpendError(
+            f"x0 has shape {jnp.shape(scenario.x0)}; one rollout starts from (4,): "
+            "vmap over batches of scenarios"
+        )
     delay = scenario.delay
     if delay is not None and not isinstance(delay, jax.core.Tracer):
         longest = int(np.max(delay))

@@ -4,7 +4,6 @@ import dataclasses
 import io
 import itertools
 import json
-import os
 import zipfile
 from importlib import resources
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from .._struct import pytree, static
 from ..designs import ROBOTS, active_joint
 from ..errors import JaxpendError, choose
+from ..files import write_atomically
 from ..observation import Observation
 
 __all__ = ["ACTIVATIONS", "Policy", "load_policy", "save_policy"]
@@ -88,15 +88,6 @@ def save_policy(path: str | Path, policy: Policy, provenance: dict[str, Any] | N
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_atomically(path, buffer.getvalue())
-
-
-def write_atomically(path: str | Path, content: bytes | str) -> None:
-    """Write a file so that a reader, or a crash, sees the old content or the new, whole."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_bytes(content.encode() if isinstance(content, str) else content)
-    os.replace(temporary, path)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
