@@ -1,0 +1,103 @@
+"""Linear quadratic regulator at the upright equilibrium, and the region where it may act.
+
+    u = -K (x - x*),   A' P + P A - P B R^-1 B' P + Q = 0,   K = R^-1 B' P
+
+with ``A, B`` the linearisation at ``x* = (pi, 0, 0, 0)``. The cost-to-go ``V = e' P e`` gives the
+region: the ellipsoid ``V <= level``. Angles are compared modulo one turn.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._struct import pytree
+from ..designs import active_joint
+from ..errors import JaxpendError
+from ..plant import Plant, linearize
+from .base import Memoryless
+
+__all__ = ["LQR", "deviation", "lqr"]
+
+# Bryson's rule: 1 / (largest acceptable value)^2 of rad, rad, rad/s, rad/s.
+DEFAULT_Q = (1.0, 1.0, 0.1, 0.1)
+DEFAULT_R = 1.0
+
+
+def deviation(x: jax.Array, goal: jax.Array) -> jax.Array:
+    """``x - goal``, (4,), with the angles wrapped to [-pi, pi)."""
+    turn = 2 * jnp.pi
+    angle = jnp.remainder(x[:2] - goal[:2] + jnp.pi, turn) - jnp.pi
+    return jnp.concatenate([angle, x[2:] - goal[2:]])
+
+
+@pytree
+class LQR(Memoryless):
+    """State feedback around a fixed point, clipped to the torque limit."""
+
+    gain: jax.Array  # (2, 4) N m per state unit; the passive joint's row is zero
+    cost_to_go: jax.Array  # (4, 4) P of V = e' P e
+    goal: jax.Array  # (4,)
+    torque_limit: jax.Array  # (2,) N m
+
+    def value(self, x: jax.Array) -> jax.Array:
+        """Cost-to-go ``V`` of a state (4,): scalar, small near the goal."""
+        error = deviation(x, self.goal)
+        return error @ self.cost_to_go @ error
+
+    def __call__(self, carry, t, x):
+        """``-K (x - goal)``, shape (2,), N m."""
+        torque = -self.gain @ deviation(x, self.goal)
+        return carry, jnp.clip(torque, -self.torque_limit, self.torque_limit)
+
+
+def lqr(
+    plant: Plant,
+    robot: str,
+    *,
+    q: tuple[float, ...] = DEFAULT_Q,
+    r: float = DEFAULT_R,
+    dt: float | None = 0.002,
+) -> LQR:
+    """LQR at upright for the driven joint of ``robot``, solved in float64 on the host (scipy).
+
+    Args:
+        plant: one plant, concrete arrays; the result has its dtype.
+        robot: "acrobot" or "pendubot".
+        q: (4,) diagonal of Q: 1/rad^2, 1/rad^2, s^2/rad^2, s^2/rad^2.
+        r: 1/(N m)^2.
+        dt: s; the discrete problem with zero-order hold, or with None the continuous one.
+
+    Raises:
+        JaxpendError: q, r or dt out of range, or a plant that has no stabilising solution.
+    """
+    from scipy.linalg import LinAlgError, expm, solve_continuous_are, solve_discrete_are
+
+    joint = active_joint(robot)
+    weights = np.asarray(q, float)
+    if weights.shape != (4,) or not (weights >= 0).all() or not r > 0 or not (dt is None or dt > 0):
+        raise JaxpendError(f"LQR needs q of 4 values >= 0, r > 0 and dt > 0; got {q}, {r}, {dt}")
+    dtype = jnp.result_type(plant.mass)
+    with jax.enable_x64(True):
+        exact = jax.tree.map(lambda v: jnp.asarray(np.asarray(v), jnp.float64), plant)
+        goal = jnp.array([jnp.pi, 0.0, 0.0, 0.0])
+        a, b = (np.asarray(m) for m in linearize(exact, goal, jnp.zeros(2)))
+    b = b[:, joint : joint + 1]
+    try:
+        if dt is None:
+            p = solve_continuous_are(a, b, np.diag(weights), r * np.eye(1))
+            k = b.T @ p / r
+        else:
+            held = expm(dt * np.block([[a, b], [np.zeros((1, 5))]]))
+            a, b = held[:4, :4], held[:4, 4:]
+            p = solve_discrete_are(a, b, dt * np.diag(weights), dt * r * np.eye(1))
+            k = b.T @ p @ a / (dt * r + b.T @ p @ b)
+    except LinAlgError as error:
+        raise JaxpendError(f"no LQR for this plant and these weights: {error}") from None
+    gain = np.zeros((2, 4))
+    gain[joint] = k[0]
+    return LQR(
+        gain=jnp.asarray(gain, dtype),
+        cost_to_go=jnp.asarray(p, dtype),
+        goal=jnp.asarray(goal, dtype),
+        torque_limit=jnp.asarray(plant.torque_limit, dtype),
+    )

@@ -1,0 +1,125 @@
+"""An optimised swing-up to follow, and its file: plain arrays and a JSON header."""
+
+import io
+import json
+import zipfile
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._struct import pytree, static
+from ..designs import ROBOTS, active_joint
+from ..errors import JaxpendError, choose
+from ..files import write_atomically
+
+__all__ = ["Nominal", "load_nominal", "read_nominal_header", "save_nominal"]
+
+FORMAT = 1
+
+
+@pytree
+class Nominal:
+    """A swing-up of N steps from hanging to upright, with the feedback that iLQR found for it."""
+
+    x: jax.Array  # (N + 1, 4) states
+    u: jax.Array  # (N,) N m, torque of the driven joint over step k
+    gain: jax.Array  # (N, 5) of (state, last torque): u + gain . (deviation, last - u_{k-1})
+    robot: str = static(default="pendubot")
+    dt: float = static(default=0.002)  # s
+
+    @property
+    def steps(self) -> int:
+        """N."""
+        return self.u.shape[0]
+
+    @property
+    def goal(self) -> jax.Array:
+        """Upright, (4,), on the turn of theta1 and theta2 where the swing-up ends."""
+        turn = 2 * jnp.pi
+        upright = jnp.array([jnp.pi, 0.0], self.x.dtype)
+        angles = upright + turn * jnp.round((self.x[-1, :2] - upright) / turn)
+        return jnp.concatenate([angles, jnp.zeros(2, self.x.dtype)])
+
+    def index(self, t: jax.Array) -> jax.Array:
+        """Step that time ``t`` (s) falls on, not clipped to the horizon; int."""
+        return jnp.round(t / self.dt).astype(int)
+
+    def both(self, torque: jax.Array) -> jax.Array:
+        """A torque of the driven joint () as torques of both joints (2,)."""
+        return jnp.where(np.arange(2) == active_joint(self.robot), torque, jnp.zeros_like(torque))
+
+
+def save_nominal(path: str | Path, nominal: Nominal, provenance: dict[str, Any]) -> None:
+    """Write a trajectory file (.npz without pickle), atomically; gains in float32."""
+    header = {
+        "format": FORMAT,
+        "kind": "swing-up",
+        "robot": nominal.robot,
+        "dt": nominal.dt,
+        "provenance": provenance,
+    }
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        header=np.array(json.dumps(header)),
+        x=np.asarray(nominal.x, "f8"),
+        u=np.asarray(nominal.u, "f8"),
+        gain=np.asarray(nominal.gain, "f4"),
+    )
+    write_atomically(path, buffer.getvalue())
+
+
+def _locate(robot_or_path: str | Path) -> Path:
+    if str(robot_or_path) not in ROBOTS:
+        return Path(robot_or_path)
+    return Path(str(resources.files("jaxpend").joinpath(f"trajectories/{robot_or_path}.npz")))
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        header = json.loads(str(arrays.pop("header")))
+    except FileNotFoundError:
+        raise JaxpendError(f"there is no trajectory file {path}") from None
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+        raise JaxpendError(f"{path} is not a trajectory file, or it is empty or cut off") from None
+    if header.get("kind") != "swing-up" or header.get("format") != FORMAT:
+        raise JaxpendError(f"{path} is not a swing-up trajectory of format {FORMAT}")
+    return header, arrays
+
+
+def read_nominal_header(robot_or_path: str | Path) -> dict[str, Any]:
+    """The JSON header of a trajectory file. Raises ``JaxpendError`` as ``load_nominal``."""
+    return _read(_locate(robot_or_path))[0]
+
+
+def load_nominal(robot_or_path: str | Path, *, robot: str | None = None) -> Nominal:
+    """Load a trajectory file, or by "acrobot" / "pendubot" the one that ships with the package.
+
+    The arrays have jax's default float type at the time of the call.
+
+    Raises:
+        JaxpendError: no such file, not a trajectory file, or one for the other robot.
+    """
+    path = _locate(robot_or_path)
+    header, arrays = _read(path)
+    try:
+        steps = arrays["u"].shape[0]
+        shapes = {name: arrays[name].shape for name in ("x", "u", "gain")}
+        name, dt = choose("robot", header["robot"], ROBOTS), float(header["dt"])
+    except (KeyError, IndexError, TypeError) as error:
+        raise JaxpendError(f"{path} lacks a part of a trajectory: {error}") from None
+    if shapes != {"x": (steps + 1, 4), "u": (steps,), "gain": (steps, 5)} or steps < 1:
+        raise JaxpendError(f"{path}: the arrays do not have the shapes of a trajectory: {shapes}")
+    if not (all(np.isfinite(arrays[n]).all() for n in shapes) and dt > 0):
+        raise JaxpendError(f"{path}: the trajectory holds values that are not finite")
+    if robot is not None and name != choose("robot", robot, ROBOTS):
+        raise JaxpendError(f"{path} is a trajectory for the {name}, not for the {robot}")
+    dtype = jnp.result_type(float)
+    x, u, gain = (jnp.asarray(arrays[n], dtype) for n in ("x", "u", "gain"))
+    return Nominal(x, u, gain, robot=name, dt=dt)

@@ -1,0 +1,89 @@
+"""Time-varying LQR along a swing-up: finite horizon, ending in the LQR at the top.
+
+    u_k = u*_k - K_k (x - x*_k),   P_N = P of the infinite horizon,
+    K_k = (R + B' P B)^-1 B' P A,   P <- Q + A' P (A - B K)
+
+with ``A, B`` the derivatives of one integration step along the trajectory (Tedrake,
+"Underactuated robotics", chapter 8).
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._struct import pytree
+from ..plant import Plant, rk4_step
+from .base import Memoryless
+from .lqr import DEFAULT_Q, DEFAULT_R, LQR, deviation, lqr
+from .nominal import Nominal
+
+__all__ = ["TVLQR", "tvlqr"]
+
+
+@pytree
+class TVLQR(Memoryless):
+    """Feed-forward and time-varying gains along a trajectory, then the LQR at its end."""
+
+    nominal: Nominal
+    gain: jax.Array  # (N, 4) N m per state unit, of the driven joint
+    top: LQR
+
+    def __call__(self, carry, t, x):
+        """Torque (2,), N m: the step nearest to ``t``; past the last one, the LQR's."""
+        nominal = self.nominal
+        index = nominal.index(t)
+        k = jnp.clip(index, 0, nominal.steps - 1)
+        torque = nominal.u[k] - self.gain[k] @ deviation(x, nominal.x[k])
+        limit = self.top.torque_limit
+        tracking = jnp.clip(nominal.both(torque), -limit, limit)
+        _, holding = self.top(None, t, x)
+        return carry, jnp.where(index < nominal.steps, tracking, holding)
+
+
+def _riccati(plant: Plant, nominal: Nominal, q: jax.Array, r: float, p_end: jax.Array) -> jax.Array:
+    """Gains (N, 4) of the finite-horizon problem along the trajectory."""
+
+    def step(x, torque):
+        return rk4_step(plant, x, nominal.both(torque), nominal.dt)
+
+    a, b = jax.vmap(jax.jacfwd(step, argnums=(0, 1)))(nominal.x[:-1], nominal.u)
+    q, r = nominal.dt * jnp.diag(q), nominal.dt * r
+
+    def backward(p, now):
+        a, b = now
+        gain = (b @ p @ a) / (r + b @ p @ b)
+        p = q + a.T @ p @ (a - jnp.outer(b, gain))
+        return 0.5 * (p + p.T), gain
+
+    return jax.lax.scan(backward, p_end, (a, b), reverse=True)[1]
+
+
+def tvlqr(
+    plant: Plant,
+    nominal: Nominal,
+    *,
+    q: tuple[float, ...] = DEFAULT_Q,
+    r: float = DEFAULT_R,
+) -> TVLQR:
+    """TVLQR along ``nominal``, solved in float64; the result has the dtype of ``nominal``.
+
+    Args:
+        plant: one plant, concrete arrays.
+        nominal: the trajectory.
+        q: (4,) diagonal of Q, of the tracking and of the LQR at the end.
+        r: 1/(N m)^2.
+
+    Raises:
+        JaxpendError: as ``lqr``.
+    """
+    dtype = nominal.x.dtype
+    top = lqr(plant, nominal.robot, q=q, r=r, dt=nominal.dt)
+    with jax.enable_x64(True):
+        exact = lambda tree: jax.tree.map(  # noqa: E731
+            lambda v: jnp.asarray(np.asarray(v), jnp.float64), tree
+        )
+        p_end = exact(lqr(exact(plant), nominal.robot, q=q, r=r, dt=nominal.dt).cost_to_go)
+        weights = jnp.asarray(np.asarray(q, float))
+        gain = np.asarray(jax.jit(_riccati)(exact(plant), exact(nominal), weights, r, p_end))
+    top = jax.tree.map(lambda v: v.astype(dtype), top).replace(goal=nominal.goal)
+    return TVLQR(nominal, jnp.asarray(gain, dtype), top)
