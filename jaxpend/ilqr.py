@@ -2,7 +2,8 @@
 
 The problem solved is
 
-    min_u  outer(sum_k features(k, z_k, u_k)) + final(z_N),   z_{k+1} = step(z_k, u_k),  |u_k| <= limit
+    min_u  outer(sum_k features(k, z_k, u_k)) + final(z_N)
+    z_{k+1} = step(z_k, u_k),  |u_k| <= limit
 
 The usual sum of stage costs is ``outer = sum``. A score that is a concave function of several
 sums (the v2 leaderboard: tanh of energy, of torque cost, ...) fits too: each iteration replaces

@@ -13,7 +13,6 @@ Sums over the horizon stand for the criteria of ``jaxpend.score``:
 and the objective is the mean of ``tanh(pi c_i / n_i)`` plus a final cost that lands upright.
 """
 
-from typing import Any
 
 import jax
 import jax.numpy as jnp
