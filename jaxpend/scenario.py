@@ -45,7 +45,7 @@ class Scenario:
     @property
     def dtype(self):
         """The floating-point type that the rollout computes in."""
-        types = [jnp.result_type(leaf) for leaf in jax.tree.leaves(self)]
+        types = [jnp.asarray(leaf).dtype for leaf in jax.tree.leaves(self)]
         return jnp.result_type(*(t for t in types if jnp.issubdtype(t, jnp.floating)))
 
 

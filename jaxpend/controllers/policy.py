@@ -92,7 +92,8 @@ def save_policy(path: str | Path, policy: Policy, provenance: dict[str, Any] | N
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # From memory: numpy leaves a file it cannot read open.
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             arrays = dict(file)
         header = json.loads(str(arrays.pop("header")))
     except FileNotFoundError:

@@ -1,0 +1,175 @@
+"""Policies: what the network computes, and what a policy file does and does not hold."""
+
+import itertools
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close, both_robots
+
+from jaxpend import JaxpendError, Policy, load_policy, save_policy
+from jaxpend.controllers.policy import read_header
+from jaxpend.designs import active_joint
+from jaxpend.observation import OBSERVATIONS, Observation
+
+KEY = jax.random.key(0)
+STATE = np.array([3.5, -7.0, 2.0, -30.0], "f4")
+NUMPY_ACTIVATIONS = {
+    "relu": lambda v: np.maximum(v, 0),
+    "tanh": np.tanh,
+    "silu": lambda v: v / (1 + np.exp(-v)),
+}
+
+
+def random_policy(robot="pendubot", kind="sincos", activation="relu", sizes=(16, 8)):
+    """A small network with weights from a fixed seed."""
+    rng = np.random.default_rng(0)
+    observation = Observation(kind)
+    widths = [observation.size, *sizes, 1]
+    layers = tuple(
+        (rng.normal(size=(a, b)).astype("f4") / 3, rng.normal(size=b).astype("f4") / 3)
+        for a, b in itertools.pairwise(widths)
+    )
+    limit = jnp.asarray(3.0, jnp.float32)
+    return Policy(layers, limit, robot=robot, observation=observation, activation=activation)
+
+
+def numpy_torque(policy, observation):
+    """The same network in plain numpy, float64."""
+    act = {
+        "relu": lambda v: np.maximum(v, 0),
+        "tanh": np.tanh,
+        "silu": lambda v: v / (1 + np.exp(-v)),
+    }
+    h = np.asarray(observation, float)
+    *hidden, (kernel, bias) = policy.layers
+    for w, b in hidden:
+        h = act[policy.activation](h @ w + b)
+    return 3.0 * np.tanh((h @ kernel + bias)[0])
+
+
+@both_robots
+@pytest.mark.parametrize("kind", OBSERVATIONS)
+@pytest.mark.parametrize("activation", NUMPY_ACTIVATIONS)
+def test_torque_is_that_of_the_network_on_the_driven_joint(robot, kind, activation):
+    policy = random_policy(robot, kind, activation)
+    carry, torque = policy(policy.reset(KEY), 0.0, jnp.asarray(STATE))
+    assert carry is None
+    observation = policy.observation(STATE)
+    assert observation.shape == (policy.observation.size,)
+    assert_close(torque[active_joint(robot)], numpy_torque(policy, observation))
+    assert torque[1 - active_joint(robot)] == 0
+
+
+def test_observations_worked_out_by_hand():
+    q1, q2, w1, w2 = STATE.astype(float)
+    sincos = [np.cos(q1), np.cos(q2), np.sin(q1), np.sin(q2), w1 / 20, w2 / 20]
+    assert_close(Observation("sincos")(STATE), sincos)
+    # Angles lie on [0, 2 pi) before they are scaled, and velocities are clipped.
+    wrapped = [(q1 - np.pi) / np.pi, (q2 + 4 * np.pi - np.pi) / np.pi, 0.1, -1.0]
+    assert_close(Observation("wrapped")(STATE), wrapped)
+    fine = Observation("fine")
+    assert_close(fine(STATE)[:6], sincos)
+    turned = STATE + np.array([2 * np.pi, -4 * np.pi, 0, 0], "f4")
+    assert_close(fine(turned), fine(STATE), times=5)
+    upright = np.array([np.pi, 0, 0, 0], "f4")
+    assert_close(fine(upright)[6:], np.zeros(fine.size - 6))
+    tipped = fine(upright + np.array([0.02, 0, 0, 0], "f4"))
+    assert np.max(np.abs(tipped[6:])) > 3 * np.max(np.abs((tipped - fine(upright))[:6]))
+
+
+def test_action_noise_is_drawn_before_the_squashing_and_anew_each_step():
+    policy = random_policy().replace(action_noise=jnp.asarray(0.1, jnp.float32))
+    quiet = policy.replace(action_noise=jnp.zeros(()))
+    step = jax.jit(lambda policy, carry: policy(carry, 0.0, STATE))
+    carry, torques = policy.reset(KEY), []
+    for _ in range(200):
+        carry, torque = step(policy, carry)
+        torques.append(torque[0])
+    noise = np.arctanh(np.array(torques) / 3.0) - float(policy.pre_action(STATE))
+    np.testing.assert_allclose(noise.std(), 0.1, rtol=0.2)
+    np.testing.assert_allclose(noise.mean(), 0.0, atol=0.03)
+    assert len(np.unique(noise)) > 190
+    greedy = random_policy()(None, 0.0, STATE)[1]
+    assert_close(step(quiet, KEY)[1], greedy)
+
+
+@both_robots
+def test_file_round_trip(tmp_path, robot):
+    policy, path = random_policy(robot, "fine", "tanh"), tmp_path / "policy.npz"
+    save_policy(path, policy, {"seed": 7})
+    loaded = load_policy(path, robot=robot)
+    assert jax.tree.structure(loaded) == jax.tree.structure(policy)
+    jax.tree.map(np.testing.assert_array_equal, loaded, policy)
+    assert read_header(path)["provenance"] == {"seed": 7}
+    assert list(tmp_path.iterdir()) == [path]
+    with np.load(path, allow_pickle=False) as arrays:
+        assert all(value.dtype != object for value in arrays.values())
+
+
+def rewritten(path, change):
+    """A policy file whose arrays and header ``change`` has had its way with."""
+    save_policy(path, random_policy())
+    with np.load(path) as file:
+        arrays = dict(file)
+    header = json.loads(str(arrays["header"]))
+    change(arrays, header)
+    np.savez(path, **arrays | {"header": np.array(json.dumps(header))})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a, h: h.update(format=99), "has policy format 99"),
+        (lambda a, h: h.pop("torque_limit"), "lacks a part of a policy: 'torque_limit'"),
+        (lambda a, h: a.pop("kernel1"), "lacks a part of a policy: 'kernel1'"),
+        (lambda a, h: h.update(layers=[6, 16, 9, 1]), "do not have the shapes"),
+        (lambda a, h: a.update(bias0=np.zeros(3, "f4")), "do not have the shapes"),
+        (lambda a, h: a.update(bias1=a["bias1"] * np.nan), "not finite or not positive"),
+        (lambda a, h: h.update(torque_limit=0.0), "not finite or not positive"),
+        (lambda a, h: h.update(robot="cartpole"), "unknown robot 'cartpole'"),
+        (lambda a, h: h.update(activation="exp"), "unknown activation 'exp'"),
+        (lambda a, h: h["observation"].update(kind="pixels"), "unknown observation kind"),
+    ],
+)
+def test_damaged_contents_are_one_sentence(tmp_path, change, words):
+    path = tmp_path / "policy.npz"
+    rewritten(path, change)
+    with pytest.raises(JaxpendError) as error:
+        load_policy(path)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("kept", [0, 10, 0.5, 0.95])
+def test_empty_and_cut_off_files_are_one_sentence(tmp_path, kept):
+    path = tmp_path / "policy.npz"
+    save_policy(path, random_policy())
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(kept if kept > 1 else kept * len(whole))])
+    with pytest.raises(JaxpendError, match="is not a policy file, or it is empty or cut off"):
+        load_policy(path)
+
+
+def test_pickled_files_are_refused(tmp_path):
+    path = tmp_path / "policy.npz"
+    np.savez(path, header=np.array([{"robot": "acrobot"}], dtype=object))
+    with pytest.raises(JaxpendError, match="is not a policy file"):
+        load_policy(path)
+
+
+def test_missing_files_and_the_other_robots_policy(tmp_path):
+    with pytest.raises(JaxpendError, match="there is no policy file"):
+        load_policy(tmp_path / "nothing.npz")
+    path = tmp_path / "policy.npz"
+    save_policy(path, random_policy("acrobot"))
+    with pytest.raises(JaxpendError, match="a policy for the acrobot, not for the pendubot"):
+        load_policy(path, robot="pendubot")
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan")])
+def test_velocity_scale_must_be_positive(scale):
+    with pytest.raises(JaxpendError, match="must be positive"):
+        Observation("sincos", scale)
