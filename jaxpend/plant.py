@@ -90,10 +90,29 @@ def gravity_vector(plant: Plant, x: jax.Array) -> jax.Array:
     return jnp.stack([g1, g2])
 
 
+def _arctan(x: jax.Array) -> jax.Array:
+    """``arctan``; in float32 to 1.4e-7 by one division and a short polynomial.
+
+    XLA's own took three quarters of the time of a float32 step on a CPU. The reduction to
+    [0, tan(pi/8)] and the coefficients are those of Moshier's Cephes library (``atanf``).
+    """
+    if jnp.result_type(x) != jnp.float32:
+        return jnp.arctan(x)
+    a = jnp.abs(x)
+    middle, far = a > 0.41421356, a > 2.41421356
+    top = jnp.where(far, -1.0, jnp.where(middle, a - 1.0, a))
+    r = top / jnp.where(far, a, jnp.where(middle, a + 1.0, 1.0))
+    offset = jnp.where(far, jnp.pi / 2, jnp.where(middle, jnp.pi / 4, 0.0))
+    z = r * r
+    p = ((8.05374449538e-2 * z - 1.38776856032e-1) * z + 1.99777106478e-1) * z - 3.33329491539e-1
+    y = offset + (p * z * r + r)
+    return jnp.where(x < 0, -y, y)
+
+
 def friction_vector(plant: Plant, x: jax.Array) -> jax.Array:
     """Friction torque ``F(omega) = b omega + c arctan(100 omega)``, shape (2,), N m."""
     omega = x[2:4]
-    return plant.damping * omega + plant.coulomb_friction * jnp.arctan(COULOMB_STEEPNESS * omega)
+    return plant.damping * omega + plant.coulomb_friction * _arctan(COULOMB_STEEPNESS * omega)
 
 
 def dynamics(plant: Plant, x: jax.Array, u: jax.Array) -> jax.Array:

@@ -195,3 +195,12 @@ def test_jitted_and_batched_steps_are_the_plain_ones():
     plain = jnp.stack([physics.rk4_step(pick(i), x[i], u[i], DT) for i in rows])
     batched = jax.jit(jax.vmap(physics.rk4_step, (0, 0, 0, None)))(plants, x, u, DT)
     assert_close(batched[np.array(rows)], plain)
+
+
+def test_fast_arctan_of_single_precision():
+    x = np.concatenate([np.linspace(-6, 6, 5001), [0.0, np.inf, -np.inf], np.logspace(-9, 9, 99)])
+    x = x.astype("f4")
+    np.testing.assert_allclose(physics._arctan(x), np.arctan(x.astype(float)), atol=2e-7)
+    slope = jax.vmap(jax.grad(physics._arctan))(x[:5001])
+    np.testing.assert_allclose(slope, 1 / (1 + x[:5001].astype(float) ** 2), atol=2e-6)
+    assert np.isnan(physics._arctan(np.float32(np.nan)))
