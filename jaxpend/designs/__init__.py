@@ -91,7 +91,8 @@ def from_dict(
         coulomb_friction=pair("cf"), torque_limit=limit, actuation=np.asarray(actuation, float),
         gravity=np.array(p["g"]), motor_inertia=np.array(p["Ir"]), gear_ratio=np.array(p["gr"]),
     )  # fmt: skip
-    return Plant(**{k: jnp.asarray(v, jnp.result_type(float)) for k, v in vars(values).items()})
+    # numpy, not jax, arrays: they stay known constants where they are made inside a jitted function.
+    return Plant(**{k: np.asarray(v, jnp.result_type(float)) for k, v in vars(values).items()})
 
 
 def from_file(path: str | Path, **kwargs) -> Plant:
