@@ -22,13 +22,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from ._struct import pytree, static
 
-__all__ = ["Problem", "Solution", "initial", "iterate", "solve"]
+__all__ = ["STEP_SIZES", "Problem", "Solution", "initial", "iterate", "solve", "warm_start"]
 
-STEP_SIZES = 2.0 ** -np.arange(0.0, 10.0)
+STEP_SIZES = tuple(2.0**-k for k in range(10))
 MU_MIN, MU_MAX = 1e-8, 1e10
 
 
@@ -129,7 +128,7 @@ def _backward(problem, params, z, u, limit, mu, second_order):
     return change, gain, valid
 
 
-def _forward(problem, params, z, u, change, gain, limit, step_size):
+def _forward(problem, params, z, u, change, gain, limit, step_size, z0=None):
     """States and inputs under ``u + step_size * change + gain (z' - z)``, clipped to the box."""
 
     def step(z_new, now):
@@ -138,25 +137,46 @@ def _forward(problem, params, z, u, change, gain, limit, step_size):
         following = problem.step(params, z_new, u_new)
         return following, (following, u_new)
 
-    z_new, u_new = jax.lax.scan(step, z[0], (z[:-1], u, change, gain))[1]
-    return jnp.concatenate([z[:1], z_new]), u_new
+    z0 = z[0] if z0 is None else z0
+    z_new, u_new = jax.lax.scan(step, z0, (z[:-1], u, change, gain))[1]
+    return jnp.concatenate([z0[None], z_new]), u_new
 
 
 def initial(problem: Problem, params: Any, z0: jax.Array, u: jax.Array, mu=1.0) -> Solution:
     """The starting point of ``iterate``: the trajectory of inputs ``u`` (N,) from ``z0`` (n,)."""
     z = _simulate(problem, params, z0, u)
+    return _start(problem, params, z, u, jnp.zeros((*u.shape, *z0.shape), z.dtype), mu)
+
+
+def warm_start(
+    problem: Problem, params: Any, z0: jax.Array, plan: Solution, limit: jax.Array, mu=1.0
+) -> Solution:
+    """``initial`` from an earlier plan, followed from ``z0`` under its own feedback."""
+    zeros = jnp.zeros_like(plan.u)
+    old = (plan.z, plan.u, zeros, plan.gain)
+    z, u = _forward(problem, params, *old, limit, 0.0, z0=z0)
+    return _start(problem, params, z, u, plan.gain, mu)
+
+
+def _start(problem, params, z, u, gain, mu):
     cost = _cost(problem, params, z, u)
-    gain = jnp.zeros((u.shape[0], z0.shape[0]), z.dtype)
     one = jnp.ones_like(cost)
     return Solution(z, u, gain, cost, mu * one, one, jnp.array(0))
 
 
 def iterate(
-    problem: Problem, params: Any, now: Solution, limit: jax.Array, *, second_order: bool = False
+    problem: Problem,
+    params: Any,
+    now: Solution,
+    limit: jax.Array,
+    *,
+    second_order: bool = False,
+    step_sizes: tuple[float, ...] = STEP_SIZES,
 ) -> Solution:
     """One iteration: backward pass, all step sizes in one vmapped forward pass, the best is kept.
 
-    Never worse than ``now``: without an improvement only the regularisation grows.
+    Never worse than ``now``: without an improvement only the regularisation grows (and the gains
+    are those of the new backward pass, around the old trajectory).
     """
     change, gain, valid = _backward(problem, params, now.z, now.u, limit, now.mu, second_order)
 
@@ -164,7 +184,7 @@ def iterate(
         z, u = _forward(problem, params, now.z, now.u, change, gain, limit, step_size)
         return z, u, _cost(problem, params, z, u)
 
-    z, u, cost = jax.vmap(attempt)(STEP_SIZES.astype(now.z.dtype))
+    z, u, cost = jax.vmap(attempt)(jnp.array(step_sizes, now.z.dtype))
     best = jnp.argmin(cost)
     better = valid & (cost[best] < now.cost)
     growth = jnp.where(

@@ -13,16 +13,16 @@ Sums over the horizon stand for the criteria of ``jaxpend.score``:
 and the objective is the mean of ``tanh(pi c_i / n_i)`` plus a final cost that lands upright.
 """
 
-
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ._struct import pytree, static
 from .ilqr import Problem
 from .plant import Plant, forward_kinematics, rk4_step
 from .score import V2_OFFICIAL
 
-__all__ = ["SwingUp", "problem"]
+__all__ = ["SwingUp", "problem", "step"]
 
 OFFICIAL_DT, OFFICIAL_STEPS = 0.002, 5000
 CRITERIA = ("swingup_time", "energy", "tau_cost", "tau_smoothness", "velocity_cost")
@@ -41,13 +41,10 @@ class SwingUp:
     dt: float = static()
 
 
-def _full(p: SwingUp, u: jax.Array) -> jax.Array:
-    return jnp.stack([u, jnp.zeros_like(u)] if p.joint == 0 else [jnp.zeros_like(u), u])
-
-
-def _step(p: SwingUp, z: jax.Array, u: jax.Array) -> jax.Array:
-    x = rk4_step(p.plant, z[:4], _full(p, u), p.dt)
-    return jnp.concatenate([x, u[None]])
+def step(p, z: jax.Array, u: jax.Array) -> jax.Array:
+    """``z`` (5,) after one step of ``p.dt`` of ``p.plant`` under torque ``u`` of ``p.joint``."""
+    torque = jnp.where(np.arange(2) == p.joint, u, jnp.zeros_like(u))
+    return jnp.concatenate([rk4_step(p.plant, z[:4], torque, p.dt), u[None]])
 
 
 def _features(p: SwingUp, k: jax.Array, z: jax.Array, u: jax.Array) -> jax.Array:
@@ -74,4 +71,4 @@ def _final(p: SwingUp, z: jax.Array) -> jax.Array:
 
 def problem() -> Problem:
     """The swing-up as an ``ilqr.Problem`` whose ``params`` are a ``SwingUp``."""
-    return Problem(step=_step, features=_features, final=_final, outer=_outer)
+    return Problem(step=step, features=_features, final=_final, outer=_outer)

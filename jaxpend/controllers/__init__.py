@@ -1,24 +1,43 @@
 """Controllers, one a file, all on the protocol of ``base.Controller``."""
 
 from .base import Controller, Feedback, OpenLoop, Zero
+from .energy import EnergyShaping, energy_shaping
+from .hybrid import Ellipsoid, Hybrid, Tolerances, ellipsoid, ellipsoid_of_torque
 from .lqr import LQR, lqr
+from .mpc import MPC, free_mpc, tracking_mpc
 from .nominal import Nominal, load_nominal, save_nominal
+from .pd import PD, pd
 from .policy import Policy, load_policy, save_policy
+from .riccati import Riccati, riccati
 from .tvlqr import TVLQR, tvlqr
 
 __all__ = [
     "LQR",
+    "MPC",
+    "PD",
     "TVLQR",
     "Controller",
+    "Ellipsoid",
+    "EnergyShaping",
     "Feedback",
+    "Hybrid",
     "Nominal",
     "OpenLoop",
     "Policy",
+    "Riccati",
+    "Tolerances",
     "Zero",
+    "ellipsoid",
+    "ellipsoid_of_torque",
+    "energy_shaping",
+    "free_mpc",
     "load_nominal",
     "load_policy",
     "lqr",
+    "pd",
+    "riccati",
     "save_nominal",
     "save_policy",
+    "tracking_mpc",
     "tvlqr",
 ]

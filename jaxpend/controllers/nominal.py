@@ -54,7 +54,7 @@ class Nominal:
 
 
 def save_nominal(path: str | Path, nominal: Nominal, provenance: dict[str, Any]) -> None:
-    """Write a trajectory file (.npz without pickle), atomically; gains in float32."""
+    """Write a trajectory file (.npz without pickle), atomically: float32, the torques float64."""
     header = {
         "format": FORMAT,
         "kind": "swing-up",
@@ -66,7 +66,7 @@ def save_nominal(path: str | Path, nominal: Nominal, provenance: dict[str, Any])
     np.savez_compressed(
         buffer,
         header=np.array(json.dumps(header)),
-        x=np.asarray(nominal.x, "f8"),
+        x=np.asarray(nominal.x, "f4"),
         u=np.asarray(nominal.u, "f8"),
         gain=np.asarray(nominal.gain, "f4"),
     )

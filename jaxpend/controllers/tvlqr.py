@@ -17,7 +17,7 @@ from .base import Memoryless
 from .lqr import DEFAULT_Q, DEFAULT_R, LQR, deviation, lqr
 from .nominal import Nominal
 
-__all__ = ["TVLQR", "tvlqr"]
+__all__ = ["TVLQR", "along", "tvlqr"]
 
 
 @pytree
@@ -40,8 +40,9 @@ class TVLQR(Memoryless):
         return carry, jnp.where(index < nominal.steps, tracking, holding)
 
 
-def _riccati(plant: Plant, nominal: Nominal, q: jax.Array, r: float, p_end: jax.Array) -> jax.Array:
-    """Gains (N, 4) of the finite-horizon problem along the trajectory."""
+@jax.jit
+def _riccati(plant: Plant, nominal: Nominal, q: jax.Array, r: float, p_end: jax.Array):
+    """Gains (N, 4) and costs-to-go (N, 4, 4) of the finite-horizon problem."""
 
     def step(x, torque):
         return rk4_step(plant, x, nominal.both(torque), nominal.dt)
@@ -53,9 +54,29 @@ def _riccati(plant: Plant, nominal: Nominal, q: jax.Array, r: float, p_end: jax.
         a, b = now
         gain = (b @ p @ a) / (r + b @ p @ b)
         p = q + a.T @ p @ (a - jnp.outer(b, gain))
-        return 0.5 * (p + p.T), gain
+        p = 0.5 * (p + p.T)
+        return p, (gain, p)
 
     return jax.lax.scan(backward, p_end, (a, b), reverse=True)[1]
+
+
+def along(
+    plant: Plant, nominal: Nominal, *, q: tuple[float, ...] = DEFAULT_Q, r: float = DEFAULT_R
+) -> tuple[jax.Array, jax.Array, LQR]:
+    """Gains (N, 4), costs-to-go (N, 4, 4) and the LQR at the end, of the tracking problem.
+
+    Solved in float64, returned in the dtype of ``nominal``. Arguments and errors as ``tvlqr``.
+    """
+    dtype = nominal.x.dtype
+    with jax.enable_x64(True):
+        exact_plant, exact_nominal = jax.tree.map(
+            lambda v: jnp.asarray(np.asarray(v), jnp.float64), (plant, nominal)
+        )
+        top = lqr(exact_plant, nominal.robot, q=q, r=r, dt=nominal.dt)
+        weights = jnp.asarray(np.asarray(q, float))
+        gain, cost_to_go = _riccati(exact_plant, exact_nominal, weights, r, top.cost_to_go)
+        found = jax.tree.map(np.asarray, (gain, cost_to_go, top.replace(goal=nominal.goal)))
+    return jax.tree.map(lambda v: jnp.asarray(v, dtype), found)
 
 
 def tvlqr(
@@ -76,14 +97,5 @@ def tvlqr(
     Raises:
         JaxpendError: as ``lqr``.
     """
-    dtype = nominal.x.dtype
-    top = lqr(plant, nominal.robot, q=q, r=r, dt=nominal.dt)
-    with jax.enable_x64(True):
-        exact = lambda tree: jax.tree.map(  # noqa: E731
-            lambda v: jnp.asarray(np.asarray(v), jnp.float64), tree
-        )
-        p_end = exact(lqr(exact(plant), nominal.robot, q=q, r=r, dt=nominal.dt).cost_to_go)
-        weights = jnp.asarray(np.asarray(q, float))
-        gain = np.asarray(jax.jit(_riccati)(exact(plant), exact(nominal), weights, r, p_end))
-    top = jax.tree.map(lambda v: v.astype(dtype), top).replace(goal=nominal.goal)
-    return TVLQR(nominal, jnp.asarray(gain, dtype), top)
+    gain, _, top = along(plant, nominal, q=q, r=r)
+    return TVLQR(nominal, gain, top)

@@ -1,0 +1,77 @@
+"""Energy shaping with collocated partial feedback linearisation.
+
+The torque of the driven joint ``a`` cancels what else accelerates it,
+
+    tau = (v - alpha_a(x, 0)) / (M^-1)_aa    so that    alpha_a = v,
+
+and ``v`` holds the joint near its upright angle while it feeds energy (J) into the motion:
+
+    v = -kp (theta_a - theta_a*) - kd omega_a + cap tanh((E* - E) (ke . omega + kick) / cap)
+
+Source: Spong, "The swing up control problem for the acrobot", 1995, and Fantoni, Lozano, Spong,
+"Energy based control of the pendubot", 2000. It circles through the top; a ``Hybrid`` with LQR
+catches it there.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._struct import pytree, static
+from ..designs import active_joint
+from ..plant import Plant, dynamics, mass_matrix, total_energy
+from .base import Memoryless
+from .lqr import deviation
+
+__all__ = ["EnergyShaping", "energy_shaping"]
+
+# Found by random search on the official score, followed by LQR: (kp, kd, ke1, ke2, cap, kick).
+GAINS = {
+    "acrobot": (15.7, 4.3, -15.2, 0.72, 195.0, 0.3),
+    "pendubot": (22.0, 6.0, 7.9, -0.16, 34.0, 0.3),
+}
+
+
+@pytree
+class EnergyShaping(Memoryless):
+    """Pumps the total energy to that of upright; needs the plant, as a model."""
+
+    plant: Plant
+    kp: jax.Array  # () 1/s^2
+    kd: jax.Array  # () 1/s
+    ke: jax.Array  # (2,) 1/(J s), of both joints' velocities
+    cap: jax.Array  # () 1/s^2, largest acceleration that the pumping may ask for
+    kick: jax.Array  # () 1/(J s^2), starts the motion at the bottom, where omega gives no sign
+    joint: int = static()
+
+    def __call__(self, carry, t, x):
+        """Torque (2,), N m, zero on the passive joint."""
+        plant, a = self.plant, self.joint
+        upright = jnp.array([jnp.pi, 0.0, 0.0, 0.0], x.dtype)
+        missing = total_energy(plant, upright) - total_energy(plant, x)
+        error = deviation(x, upright)
+        wanted = (
+            -self.kp * error[a]
+            - self.kd * x[2 + a]
+            + self.cap * jnp.tanh(missing * (self.ke @ x[2:] + self.kick) / self.cap)
+        )
+        free = dynamics(plant, x, jnp.zeros(2, x.dtype))[2 + a]
+        mass = mass_matrix(plant, x)
+        determinant = mass[0, 0] * mass[1, 1] - mass[0, 1] ** 2
+        torque = (wanted - free) * determinant / mass[1 - a, 1 - a]
+        limit = plant.torque_limit
+        return carry, jnp.clip(jnp.where(np.arange(2) == a, torque, 0.0), -limit, limit)
+
+
+def energy_shaping(
+    plant: Plant, robot: str, gains: tuple[float, ...] | None = None
+) -> EnergyShaping:
+    """Energy shaping for ``robot``; ``gains`` are (kp, kd, ke1, ke2, cap, kick), default tuned ones.
+
+    Raises ``JaxpendError`` for an unknown robot.
+    """
+    joint = active_joint(robot)
+    kp, kd, ke1, ke2, cap, kick = jnp.asarray(
+        GAINS[robot] if gains is None else gains, plant.mass.dtype
+    )
+    return EnergyShaping(plant, kp, kd, jnp.stack([ke1, ke2]), cap, kick, joint=joint)

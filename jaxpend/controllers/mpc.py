@@ -1,0 +1,262 @@
+"""Model predictive control by iLQR: a receding horizon, re-optimised from a warm start.
+
+Every ``every`` steps of the prediction the plan is shifted, followed from the measured state
+under its own feedback, and improved by a few iterations of ``jaxpend.ilqr``; in between the plan
+is played with its gains. The cost, with ``e = x - x_ref``,
+
+    sum dt (e' Q e + r (u - u_ref)^2) + s (u_k - u_{k-1} - change of u_ref)^2 + e_H' P e_H
+
+has as reference either a swing-up (then ``P`` is the tracking problem's own cost-to-go where
+the horizon ends, so that a short horizon is enough), or upright itself (it flies free).
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._struct import pytree, static
+from ..designs import active_joint
+from ..errors import JaxpendError
+from ..ilqr import Problem, Solution, iterate, solve, warm_start
+from ..plant import Plant
+from ..swingup import step
+from .lqr import DEFAULT_Q, deviation, lqr
+from .nominal import Nominal
+from .tvlqr import along
+
+__all__ = ["MPC", "free_mpc", "tracking_mpc"]
+
+STEP_SIZES = (1.0, 0.5, 0.2)
+# How far from a grid point, in steps of the prediction, rounding may put a time stamp.
+GRID = 0.02
+
+
+@pytree
+class _Window:
+    """The problem of one horizon: ``params`` of the ``ilqr.Problem``."""
+
+    plant: Plant
+    x_ref: jax.Array  # (H + 1, 4)
+    u_ref: jax.Array  # (H,)
+    q: jax.Array  # (4,) per second
+    r: jax.Array  # () per second
+    smoothness: jax.Array  # () s
+    p_end: jax.Array  # (4, 4)
+    joint: int = static()
+    dt: float = static()
+
+
+def _features(p: _Window, k, z, u):
+    error = z[:4] - p.x_ref[k]
+    change = u - z[4] - (p.u_ref[k] - p.u_ref[jnp.maximum(k - 1, 0)])
+    cost = p.dt * (error @ (p.q * error) + p.r * (u - p.u_ref[k]) ** 2)
+    return (cost + p.smoothness * change**2)[None]
+
+
+def _final(p: _Window, z):
+    error = z[:4] - p.x_ref[-1]
+    return error @ p.p_end @ error
+
+
+PROBLEM = Problem(step=step, features=_features, final=_final, outer=lambda p, sums: sums[0])
+
+
+@pytree
+class MPC:
+    """iLQR over a receding horizon of H steps. Its memory is the plan."""
+
+    plant: Plant  # the model it predicts with
+    x_ref: jax.Array  # (N + 1, 4) reference; past its end, its last state
+    u_ref: jax.Array  # (N,)
+    cost_to_go: jax.Array  # (N + 1, 4, 4)
+    q: jax.Array  # (4,) 1/(rad^2 s), ..., weights of the deviation
+    r: jax.Array  # () 1/(N^2 m^2 s)
+    smoothness: jax.Array  # () 1/(N m)^2
+    first: Solution  # plan at t = 0
+    joint: int = static()
+    horizon: int = static(default=100)  # H
+    dt: float = static(default=0.002)  # s, step of the prediction
+    every: int = static(default=5)  # steps between two optimisations
+    iterations: int = static(default=2)
+
+    def _torque(self, k: jax.Array) -> jax.Array:
+        """Reference torques of steps ``k`` (any shape), zero past the end."""
+        last = self.u_ref.shape[0] - 1
+        return jnp.where(k > last, 0.0, self.u_ref[jnp.minimum(k, last)])
+
+    def _window(self, k: jax.Array) -> _Window:
+        """The reference over the horizon that starts at its step ``k``."""
+        ahead = k + np.arange(self.horizon + 1)
+        rows = jnp.minimum(ahead, self.x_ref.shape[0] - 1)
+        return _Window(
+            self.plant, self.x_ref[rows], self._torque(ahead[:-1]), self.q, self.r, self.smoothness,
+            self.cost_to_go[rows[-1]], joint=self.joint, dt=self.dt,
+        )  # fmt: skip
+
+    def reset(self, key: jax.Array) -> tuple[Solution, jax.Array]:
+        """The first plan, and no torque applied yet."""
+        return self.first, jnp.zeros((), self.x_ref.dtype)
+
+    def _shift(self, plan: Solution, k: jax.Array) -> Solution:
+        """The plan from ``every`` steps later; its new end is the reference's torque."""
+        n, h = self.every, self.horizon
+        z = jnp.concatenate([plan.z[n:], jnp.broadcast_to(plan.z[-1], (n, 5))])
+        gain = jnp.concatenate([plan.gain[n:], jnp.zeros((n, 5), plan.gain.dtype)])
+        u = jnp.concatenate([plan.u[n:], self._torque(k + np.arange(h - n, h))])
+        return plan.replace(z=z, u=u, gain=gain)
+
+    def _optimise(self, plan: Solution, k, x, last) -> Solution:
+        """The plan for the horizon from step ``k``, from the measured state ``x``."""
+        window = self._window(k)
+        limit = self.plant.torque_limit[self.joint]
+        shifted = jax.tree.map(lambda a, b: jnp.where(k == 0, a, b), plan, self._shift(plan, k))
+        # Angles are measured modulo a turn or not; the plan knows on which turn it is.
+        expected = shifted.z[0, :4]
+        x = expected + deviation(x, expected)
+        start = warm_start(PROBLEM, window, jnp.append(x, last), shifted, limit, mu=1e-6)
+
+        def improve(now, _):
+            return iterate(PROBLEM, window, now, limit, step_sizes=STEP_SIZES), None
+
+        return jax.lax.scan(improve, start, length=self.iterations)[0]
+
+    def __call__(self, carry: Any, t, x):
+        """New plan and torque (2,), N m. The plan is remade when ``t`` falls on its grid."""
+        plan, last = carry
+        place = t / self.dt
+        nearest = jnp.round(place)
+        on_grid = jnp.abs(place - nearest) < GRID
+        place = jnp.where(on_grid, nearest, place)
+        k = jnp.floor(place).astype(int)
+        since = k % self.every
+        plan = jax.lax.cond(
+            on_grid & (since == 0), lambda: self._optimise(plan, k, x, last), lambda: plan
+        )
+        part = (place - k).astype(last.dtype)
+        z = (1 - part) * plan.z[since] + part * plan.z[since + 1]
+        u = (1 - part) * plan.u[since] + part * plan.u[since + 1]
+        error = jnp.append(deviation(x, z[:4]), jnp.where(on_grid, last - z[4], 0.0))
+        limit = self.plant.torque_limit[self.joint]
+        # A plan that diverged has no torque to offer; zero keeps the rest of a batch clean.
+        torque = jnp.nan_to_num(u + plan.gain[since] @ error)
+        torque = jnp.clip(torque, -limit, limit).astype(last.dtype)
+        return (plan, torque), jnp.where(np.arange(2) == self.joint, torque, 0.0)
+
+
+def tracking_mpc(
+    plant: Plant,
+    nominal: Nominal,
+    *,
+    q: tuple[float, ...] = DEFAULT_Q,
+    r: float = 10.0,
+    smoothness: float = 1.0,
+    horizon: int = 100,
+    every: int = 5,
+    iterations: int = 2,
+) -> MPC:
+    """MPC that stabilises a swing-up and then the top; ``horizon`` in steps of its ``dt``.
+
+    The other arguments are as in ``tvlqr`` and ``MPC``.
+
+    Raises:
+        JaxpendError: a horizon, ``every`` or ``iterations`` that do not fit, and as ``lqr``.
+    """
+    _check(horizon, every, iterations, nominal.steps)
+    gain, cost_to_go, top = along(plant, nominal, q=q, r=r)
+    dtype = nominal.x.dtype
+    z = jnp.column_stack([nominal.x, jnp.concatenate([jnp.zeros(1, dtype), nominal.u])])
+    gain = jnp.pad(-gain, ((0, 0), (0, 1)))
+    return MPC(
+        plant=plant,
+        x_ref=jnp.concatenate([nominal.x[:-1], nominal.goal[None]]),
+        u_ref=nominal.u,
+        cost_to_go=jnp.concatenate([cost_to_go, top.cost_to_go[None]]),
+        q=jnp.asarray(q, dtype),
+        r=jnp.asarray(r, dtype),
+        smoothness=jnp.asarray(smoothness, dtype),
+        first=_plan(z[: horizon + 1], nominal.u[:horizon], gain[:horizon]),
+        joint=active_joint(nominal.robot),
+        horizon=horizon,
+        dt=nominal.dt,
+        every=every,
+        iterations=iterations,
+    )
+
+
+def free_mpc(
+    plant: Plant,
+    robot: str,
+    *,
+    q: tuple[float, ...] = (0.1, 0.1, 0.02, 0.02),
+    r: float = 1.0,
+    smoothness: float = 1.0,
+    horizon: int = 80,
+    dt: float = 0.02,
+    every: int = 1,
+    iterations: int = 3,
+    first_iterations: int = 200,
+    starts: int = 16,
+    key: jax.Array | None = None,
+) -> MPC:
+    """MPC that finds its own way up: the reference is upright, the final cost that of LQR.
+
+    The plan from hanging is the best of ``starts`` random sinusoids (drawn from ``key``, default
+    ``jax.random.key(0)``), each optimised for ``first_iterations``; the other arguments are as in
+    ``MPC``.
+
+    Raises:
+        JaxpendError: a horizon, ``every`` or ``iterations`` that do not fit, and as ``lqr``.
+    """
+    _check(horizon, every, iterations, horizon)
+    top = lqr(plant, robot, dt=dt)
+    dtype = plant.mass.dtype
+    zeros = jnp.zeros((horizon, 5), dtype)
+    mpc = MPC(
+        plant=plant,
+        x_ref=top.goal[None],
+        u_ref=jnp.zeros(1, dtype),
+        cost_to_go=top.cost_to_go[None],
+        q=jnp.asarray(q, dtype),
+        r=jnp.asarray(r, dtype),
+        smoothness=jnp.asarray(smoothness, dtype),
+        first=_plan(jnp.zeros((horizon + 1, 5), dtype), zeros[:, 0], zeros),
+        joint=active_joint(robot),
+        horizon=horizon,
+        dt=dt,
+        every=every,
+        iterations=iterations,
+    )
+    key = jax.random.key(0) if key is None else key
+    return mpc.replace(first=_first_plan(mpc, key, starts, first_iterations))
+
+
+def _plan(z: jax.Array, u: jax.Array, gain: jax.Array) -> Solution:
+    zero = jnp.zeros((), z.dtype)
+    return Solution(z, u, gain, zero, zero + 1, zero + 1, jnp.array(0))
+
+
+@partial(jax.jit, static_argnames=("starts", "iterations"))
+def _first_plan(mpc: MPC, key: jax.Array, starts: int, iterations: int) -> Solution:
+    """The best plan from hanging, of several random sinusoids of up to 2 Hz and 2 N m."""
+    rate_key, phase_key, size_key = jax.random.split(key, 3)
+    rate = 4 * jnp.pi * jax.random.uniform(rate_key, (starts, 1))
+    phase = 2 * jnp.pi * jax.random.uniform(phase_key, (starts, 1))
+    size = 2 * jax.random.uniform(size_key, (starts, 1))
+    u = size * jnp.sin(rate * mpc.dt * np.arange(mpc.horizon) + phase)
+    z0 = jnp.zeros(5, mpc.x_ref.dtype)
+    limit = mpc.plant.torque_limit[mpc.joint]
+    window = mpc._window(jnp.array(0))
+    optimise = lambda u: solve(PROBLEM, window, z0, u, limit, iterations=iterations)  # noqa: E731
+    plans = jax.vmap(optimise)(u.astype(z0.dtype))
+    return jax.tree.map(lambda v: v[jnp.argmin(plans.cost)], plans)
+
+
+def _check(horizon: int, every: int, iterations: int, longest: int) -> None:
+    if not (1 <= every < horizon <= longest and iterations >= 1):
+        raise JaxpendError(
+            f"MPC needs 1 <= every < horizon <= {longest} and iterations >= 1; "
+            f"got every = {every}, horizon = {horizon}, iterations = {iterations}"
+        )
