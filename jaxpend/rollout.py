@@ -15,8 +15,12 @@ from .scenario import Scenario
 
 __all__ = ["Trajectory", "final_state", "rollout", "time_stamps"]
 
-# Standard normals of one step, in the order of the reference simulator.
-NOISE = {"measurement": slice(0, 4), "torque": slice(4, 6), "process": slice(6, 10)}
+# Columns of the standard normals of one step, in the order of the reference simulator.
+NOISE = {
+    "measurement_noise": slice(0, 4),
+    "torque_noise": slice(4, 6),
+    "process_noise": slice(6, 10),
+}
 
 
 @pytree
@@ -42,6 +46,19 @@ def time_stamps(dt: float, duration: float) -> np.ndarray:
     return t[: int(np.argmax(t >= duration)) + 1]
 
 
+def _draws(scenario: Scenario, key, normals, steps: int, dtype) -> dict[str, jax.Array]:
+    """Standard normals (steps, columns) of each noise that the scenario has, and of no other.
+
+    Drawn for all steps at once: a draw in every step cost more than the physics.
+    """
+    noisy = [name for name in NOISE if getattr(scenario, name) is not None]
+    if normals is not None:
+        return {name: jnp.asarray(normals, dtype)[:, NOISE[name]] for name in noisy}
+    keys = dict(zip(NOISE, jax.random.split(key, len(NOISE)), strict=True))
+    columns = {name: NOISE[name].stop - NOISE[name].start for name in noisy}
+    return {name: jax.random.normal(keys[name], (steps, columns[name]), dtype) for name in noisy}
+
+
 def _measure(scenario: Scenario, history, k, x, z):
     """Delayed and noisy measurement; returns it with the updated ring buffer of past states."""
     measured = x
@@ -51,7 +68,7 @@ def _measure(scenario: Scenario, history, k, x, z):
         lagged = jnp.maximum(k - scenario.delay, 0) % slots
         measured = jnp.take_along_axis(history, lagged[None], axis=0)[0]
     if scenario.measurement_noise is not None:
-        measured = measured + scenario.measurement_noise * z[NOISE["measurement"]]
+        measured = measured + scenario.measurement_noise * z["measurement_noise"]
     return history, measured
 
 
@@ -61,7 +78,7 @@ def _actuate(scenario: Scenario, command, applied_before, t_pulse, z):
     if scenario.responsiveness is not None:
         u = applied_before + scenario.responsiveness * (u - applied_before)
     if scenario.torque_noise is not None:
-        u = u + scenario.torque_noise * z[NOISE["torque"]]
+        u = u + scenario.torque_noise * z["torque_noise"]
     limit = scenario.plant.torque_limit
     u = jnp.clip(u, -limit, limit)
     if scenario.pulses is not None:
@@ -76,31 +93,23 @@ def _closed_loop(scenario, controller, key, dt, duration, integrator, delay_slot
     plant = scenario.plant
     x0 = jnp.zeros(4, dtype) if scenario.x0 is None else jnp.asarray(scenario.x0, dtype)
     noise_key, controller_key = jax.random.split(key)
-    is_noisy = any(
-        sigma is not None
-        for sigma in (scenario.measurement_noise, scenario.torque_noise, scenario.process_noise)
-    )
     # The reference looks disturbances up at int(t / dt) of its drifting float time.
     inputs = {
         "k": np.arange(steps),
         "t": stamps[:-1].astype(dtype),
         "t_pulse": ((stamps[:-1] / dt).astype(int) * dt).astype(dtype),
+        "z": _draws(scenario, noise_key, normals, steps, dtype),
     }
-    if normals is not None:
-        inputs["z"] = jnp.asarray(normals, dtype)
 
     def step(carry, now):
         x, u, memory, history = carry
-        z = now.get("z")
-        if is_noisy and z is None:
-            z = jax.random.normal(jax.random.fold_in(noise_key, now["k"]), (10,), dtype)
-        history, measured = _measure(scenario, history, now["k"], x, z)
+        history, measured = _measure(scenario, history, now["k"], x, now["z"])
         memory, command = controller(memory, now["t"], measured)
         command = jnp.asarray(command, dtype)
-        u = _actuate(scenario, command, u, now["t_pulse"], z)
+        u = _actuate(scenario, command, u, now["t_pulse"], now["z"])
         x_next = integrator(plant, x, u, dt)
         if scenario.process_noise is not None:
-            x_next = x_next + scenario.process_noise * z[NOISE["process"]]
+            x_next = x_next + scenario.process_noise * now["z"]["process_noise"]
         return (x_next, u, memory, history), (x, u, measured, command) if record else None
 
     history = None if scenario.delay is None else jnp.broadcast_to(x0, (delay_slots, 4))

@@ -12,7 +12,7 @@ from ._struct import pytree
 from .errors import JaxpendError, choose
 from .plant import Plant
 
-__all__ = ["Pulses", "Scenario", "delay_steps"]
+__all__ = ["Pulses", "Scenario", "check_values", "delay_steps", "random_pulses"]
 
 
 @pytree
@@ -63,3 +63,71 @@ def delay_steps(delay: float, dt: float = 0.002, mode: str = "posvel") -> np.nda
         raise JaxpendError(f"delay is {delay} s; it must be finite and not negative")
     lagging = {"posvel": [1, 1, 1, 1], "vel": [0, 0, 1, 1], "none": [0, 0, 0, 0]}
     return int(delay / dt) * np.array(lagging[choose("delay mode", mode, lagging)])
+
+
+def random_pulses(
+    key: jax.Array,
+    *,
+    duration: float = 10.0,
+    per_joint: int = 3,
+    distance: float = 1.0,
+    width: tuple[float, float] = (0.05, 0.1),
+    amplitude: tuple[float, float] = (0.5, 5.0),
+) -> Pulses:
+    """Random disturbance pulses, distributed as in the RealAIGym robustness benchmark.
+
+    Args:
+        key: consumed.
+        duration: s, of the run.
+        per_joint: pulses on each joint.
+        distance: s, the least one between any two centres, and from the start.
+        width: s, range of the (uniform) standard deviations.
+        amplitude: N m, range of the (uniform) amplitudes; the sign is a coin's.
+
+    Raises:
+        JaxpendError: more pulses than fit into the duration.
+    """
+    n = 2 * per_joint
+    slack = (duration - (n + 1) * distance) / n
+    if slack < 0:
+        raise JaxpendError(f"{n} pulses {distance} s apart do not fit into {duration} s")
+    wait_key, joint_key, width_key, amplitude_key = jax.random.split(key, 4)
+    centres = jnp.cumsum(distance + slack * jax.random.uniform(wait_key, (n,)))
+    shape = (2, per_joint)
+    span = amplitude[1] - amplitude[0]
+    offset = jax.random.uniform(amplitude_key, shape, minval=-span, maxval=span)
+    return Pulses(
+        time=jax.random.permutation(joint_key, centres).reshape(shape),
+        width=jax.random.uniform(width_key, shape, minval=width[0], maxval=width[1]),
+        amplitude=offset + amplitude[0] * jnp.sign(offset),
+    )
+
+
+def _scales(scenario: Scenario):
+    """Names of what must not be negative, and the values."""
+    for name in ("measurement_noise", "delay", "process_noise", "torque_noise", "responsiveness"):
+        if getattr(scenario, name) is not None:
+            yield name, getattr(scenario, name)
+    yield "torque_limit", scenario.plant.torque_limit
+    if scenario.pulses is not None:
+        yield "pulse width", scenario.pulses.width
+
+
+def check_values(scenario: Scenario) -> None:
+    """Refuse numbers that mean nothing; one scenario or a batch. Traced values are not looked at.
+
+    Raises:
+        JaxpendError: a negative noise, delay, responsiveness, width or torque limit, or a value
+            that is not finite (torque limits may be infinite).
+    """
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(scenario))
+    if traced:
+        return
+    for name, value in _scales(scenario):
+        if np.any(np.asarray(value) < 0):
+            raise JaxpendError(f"{name} is {np.min(value)}; it must not be negative")
+    for path, value in jax.tree_util.tree_leaves_with_path(scenario):
+        name = jax.tree_util.keystr(path, simple=True, separator=" ")
+        bad = np.isnan(value) if name == "plant torque_limit" else ~np.isfinite(value)
+        if np.any(bad):
+            raise JaxpendError(f"{name} holds a value that is not finite")

@@ -1,0 +1,244 @@
+"""Many scenarios through the same rollout: outcomes, severity curves, maps, the worst case.
+
+A sweep runs in chunks of a Python loop over one compiled program, so its size is bounded by
+time and not by memory. Only final states leave it, and scores if asked for.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ._struct import pytree
+from .controllers.base import Controller
+from .errors import JaxpendError
+from .plant import Plant
+from .rollout import final_state, rollout
+from .scenario import Scenario, check_values
+from .score import criteria, score_v2
+from .variations import vary
+
+__all__ = [
+    "EPSILON",
+    "Outcome",
+    "Survey",
+    "compile_sweep",
+    "mildest_failure",
+    "survey",
+    "sweep",
+    "upright",
+]
+
+# Success: the final state within these of upright (rad, rad, rad/s, rad/s), strictly.
+EPSILON = (0.35, 0.35, 1.0, 1.0)
+
+
+@pytree
+class Outcome:
+    """What became of n rollouts."""
+
+    x: jax.Array  # (n, 4) final state
+    success: jax.Array  # (n,) bool, upright at the end
+    diverged: jax.Array  # (n,) bool, not a number: a failure
+    score: jax.Array | None = None  # (n,) v2 score, 0 for a failure of its own rule
+
+
+def upright(x: jax.Array) -> jax.Array:
+    """Whether states (..., 4) are within ``EPSILON`` of upright; False for what is not a number.
+
+    theta1 is taken modulo 2 pi and theta2 wrapped to [-pi, pi), as the benchmark does.
+    """
+    theta1 = jnp.mod(x[..., 0], 2 * jnp.pi) - jnp.pi
+    theta2 = jnp.mod(x[..., 1] + jnp.pi, 2 * jnp.pi) - jnp.pi
+    off = jnp.stack([theta1, theta2, x[..., 2], x[..., 3]], axis=-1)
+    return jnp.all(jnp.abs(off) < jnp.asarray(EPSILON, x.dtype), axis=-1)
+
+
+@partial(jax.jit, static_argnames=("scored", "dt", "duration", "delay_slots"))
+def _run(scenarios, controller, keys, *, scored, dt, duration, delay_slots):
+    """One chunk."""
+    options = {"dt": dt, "duration": duration, "delay_slots": delay_slots}
+
+    def one(scenario, key):
+        if not scored:
+            return final_state(scenario, controller, key, **options), None
+        run = rollout(scenario, controller, key, **options)
+        c = criteria(run.t, run.x, run.u, scenario.plant, t_final=duration)
+        return run.x[-1], score_v2(c)
+
+    x, score = jax.vmap(one)(scenarios, keys)
+    return Outcome(x, upright(x), ~jnp.all(jnp.isfinite(x), axis=-1), score)
+
+
+def _options(scenarios: Scenario, scored: bool, dt: float, duration: float) -> dict[str, Any]:
+    """Static arguments of ``_run``; the buffer is as long as the longest delay needs."""
+    longest = 0 if scenarios.delay is None else int(np.max(scenarios.delay))
+    return {"scored": scored, "dt": dt, "duration": duration, "delay_slots": longest + 1}
+
+
+def _chunks(scenarios: Scenario, keys: jax.Array, size: int) -> Iterator[tuple]:
+    """Equal pieces of at most ``size``, the last one filled up with copies of the last rollout."""
+    n = len(keys)
+    pieces = -(-n // size)
+    size = -(-n // pieces)
+    for start in range(0, n, size):
+        index = np.minimum(np.arange(start, start + size), n - 1)
+        yield jax.tree.map(lambda leaf, at=index: leaf[at], (scenarios, keys))
+
+
+def sweep(
+    scenarios: Scenario,
+    controller: Controller,
+    key: jax.Array,
+    *,
+    scored: bool = False,
+    dt: float = 0.002,
+    duration: float = 10.0,
+    chunk: int | None = None,
+) -> Outcome:
+    """Run one controller on a batch of scenarios.
+
+    A rollout that diverges is a failure, flagged as diverged, and touches no other.
+
+    Args:
+        scenarios: every leaf with a leading axis of n, as ``vary`` makes them.
+        controller: one for all.
+        key: split once per rollout, whatever the chunk, so chunking changes nothing.
+        scored: the v2 performance score as well, which keeps a chunk of trajectories in memory.
+        dt, duration: s.
+        chunk: rollouts at a time; by default 4096, or 512 when scored.
+
+    Returns:
+        The outcome with numpy arrays, n long.
+
+    Raises:
+        JaxpendError: values that mean nothing (see ``check_values``), or a chunk below 1.
+    """
+    check_values(scenarios)
+    n = len(scenarios.plant.mass)
+    size = (512 if scored else 4096) if chunk is None else chunk
+    if size < 1:
+        raise JaxpendError(f"chunk is {size}; it must be at least 1")
+    options = _options(scenarios, scored, dt, duration)
+    keys = jax.random.split(key, n)
+    pieces = [_run(s, controller, k, **options) for s, k in _chunks(scenarios, keys, size)]
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:n], *pieces)
+
+
+def compile_sweep(
+    scenarios: Scenario,
+    controller: Controller,
+    key: jax.Array,
+    *,
+    scored: bool = False,
+    dt: float = 0.002,
+    duration: float = 10.0,
+    chunk: int | None = None,
+) -> None:
+    """Compile what ``sweep`` with the same arguments runs, so that it does not have to."""
+    size = (512 if scored else 4096) if chunk is None else chunk
+    keys = jax.random.split(key, len(scenarios.plant.mass))
+    first, its_keys = next(_chunks(scenarios, keys, size))
+    options = _options(scenarios, scored, dt, duration)
+    _run.lower(first, controller, its_keys, **options).compile()
+
+
+@dataclasses.dataclass(frozen=True)
+class Survey:
+    """Outcomes over a grid of imperfections: a curve for one name, a map for two."""
+
+    values: dict[str, np.ndarray]  # name -> grid values, one axis each, in this order
+    success: np.ndarray  # fraction of the repetitions
+    diverged: np.ndarray  # number of the repetitions
+    score: np.ndarray | None  # mean v2 score of the repetitions
+
+
+def survey(
+    scenario: Scenario | Plant,
+    controller: Controller,
+    grid: Mapping[str, Any],
+    key: jax.Array,
+    *,
+    repetitions: int = 1,
+    **options: Any,
+) -> Survey:
+    """Success (and score) over the product of the grid's values.
+
+    Args:
+        scenario: what holds apart from the grid, or a plant for the nominal one.
+        controller: the one judged.
+        grid: name in ``VARIATIONS`` to its values, SI units.
+        key: for the scenarios' draws and the rollouts' noise.
+        repetitions: rollouts of each grid point, with draws of their own.
+        **options: of ``sweep``: scored, dt, duration, chunk.
+
+    Raises:
+        JaxpendError: as ``vary`` and ``sweep``, or fewer than one repetition.
+    """
+    if repetitions < 1:
+        raise JaxpendError(f"repetitions is {repetitions}; it must be at least 1")
+    scenario = Scenario(scenario) if isinstance(scenario, Plant) else scenario
+    values = {name: np.atleast_1d(np.asarray(v, float)) for name, v in grid.items()}
+    points = np.meshgrid(*values.values(), np.arange(repetitions), indexing="ij")[:-1]
+    changes = {name: p.ravel() for name, p in zip(values, points, strict=True)}
+    draw_key, run_key = jax.random.split(key)
+    scenarios = vary(scenario, changes, key=draw_key, dt=options.get("dt", 0.002))
+    outcome = sweep(scenarios, controller, run_key, **options)
+    shape = points[0].shape
+    over = lambda a, rule: None if a is None else rule(a.reshape(shape), axis=-1)  # noqa: E731
+    return Survey(
+        values=values,
+        success=over(outcome.success, np.mean),
+        diverged=over(outcome.diverged, np.sum),
+        score=over(outcome.score, np.mean),
+    )
+
+
+def mildest_failure(
+    scenario: Scenario | Plant,
+    controller: Controller,
+    ranges: Mapping[str, tuple[float, float]],
+    key: jax.Array,
+    *,
+    samples: int = 1024,
+    **options: Any,
+) -> dict[str, Any]:
+    """The worst case found: the least that has to go wrong for the controller to fail.
+
+    Draws combinations of imperfections uniformly between nothing wrong and as bad as it gets,
+    and of those that fail returns the one with the smallest severity: the largest, over the
+    imperfections, of the fraction of the way to its bad end.
+
+    Args:
+        scenario, controller: as in ``survey``.
+        ranges: name to (harmless value, bad value).
+        key: for samples, draws and noise.
+        samples: combinations tried.
+        **options: of ``sweep``.
+
+    Returns:
+        ``failures`` (fraction of the samples), and if there are any ``severity`` in [0, 1] and
+        ``values``, else None in their place.
+    """
+    scenario = Scenario(scenario) if isinstance(scenario, Plant) else scenario
+    place_key, draw_key, run_key = jax.random.split(key, 3)
+    fraction = np.asarray(jax.random.uniform(place_key, (samples, len(ranges))), float)
+    # Uniform in severity: else almost all samples of many imperfections would be bad in one.
+    fraction *= np.linspace(0, 1, samples)[:, None] / fraction.max(axis=1, keepdims=True)
+    ends = np.array(list(ranges.values()), float)
+    values = ends[:, 0] + fraction * (ends[:, 1] - ends[:, 0])
+    changes = dict(zip(ranges, values.T, strict=True))
+    scenarios = vary(scenario, changes, key=draw_key, dt=options.get("dt", 0.002))
+    failed = np.flatnonzero(~sweep(scenarios, controller, run_key, **options).success)
+    if not len(failed):
+        return {"failures": 0.0, "severity": None, "values": None}
+    worst = failed[np.argmin(fraction[failed].max(axis=1))]
+    return {
+        "failures": len(failed) / samples,
+        "severity": float(fraction[worst].max()),
+        "values": {name: float(v[worst]) for name, v in changes.items()},
+    }

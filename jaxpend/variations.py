@@ -1,0 +1,154 @@
+"""Named imperfections: batches of scenarios in which one thing, or several, goes wrong.
+
+``vary(scenario, {"m2": masses, "delay": delays}, key=key)`` is a batch of scenarios, one for
+each pair of values. Everything the robustness benchmark, severity curves and maps need is a
+call of it with the right values.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from .errors import JaxpendError, choose
+from .scenario import Scenario, delay_steps, random_pulses
+
+__all__ = ["VARIATIONS", "Variation", "vary"]
+
+# (batch of n scenarios in numpy arrays, n values, n keys) -> batch of scenarios
+Apply = Callable[[Scenario, np.ndarray, jax.Array], Scenario]
+
+
+@dataclasses.dataclass(frozen=True)
+class Variation:
+    """One thing that can be wrong, and how."""
+
+    apply: Apply
+    title: str
+    unit: str
+    least: float = -np.inf  # values below make no sense
+    in_steps: bool = False  # seconds that the reference cuts off to whole steps
+
+    def checked(self, name: str, values: Any, dt: float) -> np.ndarray:
+        """The values (n,) as ``apply`` takes them. Raises ``JaxpendError`` for nonsense."""
+        values = np.atleast_1d(np.asarray(values, float))
+        for value in values[~(np.isfinite(values) & (values >= self.least))]:
+            rule = "finite" if not np.isfinite(value) else f"at least {self.least:g}"
+            raise JaxpendError(f"{name} is {value} {self.unit}; it must be {rule}".rstrip())
+        if self.in_steps:
+            return np.array([delay_steps(value, dt)[0] for value in values])
+        return values
+
+
+def _plant(field: str, index: int | None = None, per: tuple[str, int] | None = None) -> Apply:
+    """Set an entry of a plant's field to the value, or to the value over another entry."""
+
+    def apply(scenario, values, keys):
+        plant = scenario.plant
+        if per is not None:
+            values = values / getattr(plant, per[0])[:, per[1]]
+        changed = np.array(getattr(plant, field))
+        changed[... if index is None else (slice(None), index)] = values
+        return scenario.replace(plant=plant.replace(**{field: changed}))
+
+    return apply
+
+
+def _noise(field: str, entries: list[int]) -> Apply:
+    """Set entries of one of the (4,) standard deviations to the value, keeping the others."""
+
+    def apply(scenario, values, keys):
+        old = getattr(scenario, field)
+        changed = np.zeros((len(values), 4), scenario.dtype) if old is None else np.array(old)
+        changed[:, entries] = values[:, None]
+        return scenario.replace(**{field: changed})
+
+    return apply
+
+
+def _torque_noise(scenario, values, keys):
+    """Noise on the driven joints only, as in the benchmark."""
+    sigma = values[:, None] * (scenario.plant.torque_limit > 0)
+    return scenario.replace(torque_noise=sigma.astype(scenario.dtype))
+
+
+def _responsiveness(scenario, values, keys):
+    return scenario.replace(responsiveness=values.astype(scenario.dtype))
+
+
+def _delay(lagging: list[int]) -> Apply:
+    """Delay some of the measured components; the values are whole steps."""
+    return lambda scenario, values, keys: scenario.replace(
+        delay=(values[:, None] * np.array(lagging)).astype("i4")
+    )
+
+
+def _perturbation(scenario, values, keys):
+    """A random series of pulses for each key, its amplitudes times the value."""
+    pulses = jax.jit(jax.vmap(random_pulses))(keys)
+    pulses = jax.tree.map(lambda a: np.asarray(a, scenario.dtype), pulses)
+    scale = values[:, None, None].astype(scenario.dtype)
+    return scenario.replace(pulses=pulses.replace(amplitude=pulses.amplitude * scale))
+
+
+VARIATIONS: dict[str, Variation] = {
+    "Ir": Variation(_plant("motor_inertia"), "motor inertia", "kg m²", 0),
+    "m1r1": Variation(_plant("com", 0, per=("mass", 0)), "m₁ r₁", "kg m"),
+    "I1": Variation(_plant("inertia", 0), "I₁", "kg m²"),
+    "b1": Variation(_plant("damping", 0), "damping 1", "N m s/rad"),
+    "cf1": Variation(_plant("coulomb_friction", 0), "friction 1", "N m"),
+    "m2r2": Variation(_plant("com", 1, per=("mass", 1)), "m₂ r₂", "kg m"),
+    "m2": Variation(_plant("mass", 1), "m₂", "kg", 0),
+    "I2": Variation(_plant("inertia", 1), "I₂", "kg m²"),
+    "b2": Variation(_plant("damping", 1), "damping 2", "N m s/rad"),
+    "cf2": Variation(_plant("coulomb_friction", 1), "friction 2", "N m"),
+    "m1": Variation(_plant("mass", 0), "m₁", "kg", 0),
+    "l1": Variation(_plant("length", 0), "l₁", "m", 0),
+    "l2": Variation(_plant("length", 1), "l₂", "m", 0),
+    "gravity": Variation(_plant("gravity"), "gravity", "m/s²"),
+    "velocity_noise": Variation(_noise("measurement_noise", [2, 3]), "velocity noise", "rad/s", 0),
+    "position_noise": Variation(_noise("measurement_noise", [0, 1]), "position noise", "rad", 0),
+    "process_noise": Variation(
+        _noise("process_noise", [0, 1, 2, 3]), "process noise", "rad, rad/s", 0
+    ),
+    "torque_noise": Variation(_torque_noise, "torque noise", "N m", 0),
+    "responsiveness": Variation(_responsiveness, "torque response", "", 0),
+    "delay": Variation(_delay([1, 1, 1, 1]), "delay", "s", 0, in_steps=True),
+    "velocity_delay": Variation(_delay([0, 0, 1, 1]), "velocity delay", "s", 0, in_steps=True),
+    "perturbation": Variation(_perturbation, "perturbation strength", "", 0),
+}
+
+
+def vary(
+    scenario: Scenario, changes: Mapping[str, Any], *, key: jax.Array, dt: float = 0.002
+) -> Scenario:
+    """A batch of n scenarios: the given one, with the i-th value of every change in the i-th.
+
+    Built in numpy: no compilation, and nothing on a device before a rollout wants it.
+
+    Args:
+        scenario: what is not changed.
+        changes: name in ``VARIATIONS`` to n values, in SI units; applied in this order.
+        key: split once per scenario and change, for those that draw something.
+        dt: s, for delays, which are cut off to whole steps of it.
+
+    Raises:
+        JaxpendError: an unknown name, values of different number, out of range or not finite.
+    """
+    values = {
+        name: VARIATIONS[choose("variation", name, VARIATIONS)].checked(name, given, dt)
+        for name, given in changes.items()
+    }
+    sizes = {len(v) for v in values.values()}
+    if len(sizes) != 1:
+        raise JaxpendError(f"variations need as many values each; got {sorted(sizes)}")
+
+    n = sizes.pop()
+    keys = jax.random.split(key, (n, len(values)))
+    kept = lambda leaf: np.broadcast_to(leaf, (n, *np.shape(leaf)))  # noqa: E731
+    batch = jax.tree.map(kept, scenario)
+    for number, (name, its_values) in enumerate(values.items()):
+        batch = VARIATIONS[name].apply(batch, its_values, keys[:, number])
+    return batch
