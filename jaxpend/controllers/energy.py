@@ -66,7 +66,7 @@ class EnergyShaping(Memoryless):
 def energy_shaping(
     plant: Plant, robot: str, gains: tuple[float, ...] | None = None
 ) -> EnergyShaping:
-    """Energy shaping for ``robot``; ``gains`` are (kp, kd, ke1, ke2, cap, kick), default tuned ones.
+    """Energy shaping for ``robot``; ``gains`` (kp, kd, ke1, ke2, cap, kick), default tuned ones.
 
     Raises ``JaxpendError`` for an unknown robot.
     """

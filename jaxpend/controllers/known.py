@@ -1,0 +1,78 @@
+"""The controllers that this package knows by name, ready to be judged."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax.numpy as jnp
+
+from ..errors import choose
+from ..plant import Plant
+from .base import Controller, OpenLoop
+from .energy import energy_shaping
+from .hybrid import Hybrid, ellipsoid_of_torque
+from .lqr import lqr
+from .mpc import free_mpc, tracking_mpc
+from .nominal import load_nominal
+from .pd import pd
+from .policy import load_policy
+from .riccati import riccati
+from .tvlqr import tvlqr
+
+__all__ = ["KNOWN", "Known", "build", "with_lqr"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """A way to make a controller for a plant and a robot."""
+
+    title: str
+    make: Callable[[Plant, str], Controller]
+
+
+def with_lqr(swingup: Controller, plant: Plant, robot: str, *, fraction: float = 1.0) -> Hybrid:
+    """``swingup`` with LQR at the top, switched by the ellipsoid where LQR does not saturate.
+
+    ``fraction`` is that of ``ellipsoid_of_torque``.
+    """
+    top = lqr(plant, robot)
+    return Hybrid(swingup, top, ellipsoid_of_torque(top, fraction))
+
+
+def _open_loop(plant: Plant, robot: str) -> Controller:
+    nominal = load_nominal(robot)
+    torques = nominal.both(nominal.u[:, None])
+    # Half a step early, so that the sum of time steps need not hit a stamp exactly.
+    return OpenLoop(nominal.dt * (jnp.arange(nominal.steps) - 0.5), torques)
+
+
+KNOWN: dict[str, Known] = {
+    "policy": Known("Policy", lambda plant, robot: load_policy(robot)),
+    "policy_lqr": Known(
+        "Policy + LQR", lambda plant, robot: with_lqr(load_policy(robot), plant, robot)
+    ),
+    "tvlqr": Known("TVLQR", lambda plant, robot: tvlqr(plant, load_nominal(robot))),
+    "mpc": Known("iLQR MPC", lambda plant, robot: tracking_mpc(plant, load_nominal(robot))),
+    "mpc_free": Known("iLQR MPC, free", free_mpc),
+    "riccati": Known(
+        "iLQR Riccati gains", lambda plant, robot: riccati(plant, load_nominal(robot))
+    ),
+    "open_loop_lqr": Known(
+        "Open loop + LQR", lambda plant, robot: with_lqr(_open_loop(plant, robot), plant, robot)
+    ),
+    "energy_lqr": Known(
+        "Energy shaping + LQR",
+        lambda plant, robot: with_lqr(energy_shaping(plant, robot), plant, robot, fraction=2.0),
+    ),
+    "open_loop": Known("Open loop", _open_loop),
+    "pd": Known("PD", pd),
+    "lqr": Known("LQR", lqr),
+}
+
+
+def build(name: str, plant: Plant, robot: str) -> Controller:
+    """The controller of that name, in the dtype of ``plant`` and of jax's default.
+
+    Raises:
+        JaxpendError: an unknown name; the message lists the known ones.
+    """
+    return KNOWN[choose("controller", name, KNOWN)].make(plant, robot)

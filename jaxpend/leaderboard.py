@@ -1,0 +1,230 @@
+"""``python -m jaxpend.leaderboard``: every controller on both v2 boards, next to published rows.
+
+Performance is the official score and its criteria in float64; robustness is the six-criterion
+benchmark in float32, as ``jaxpend.robustness`` runs it.
+"""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from . import cli, designs, report
+from .controllers.base import Controller
+from .controllers.known import KNOWN, build
+from .controllers.policy import load_policy
+from .errors import JaxpendError, choose
+from .files import write_atomically
+from .robustness import CRITERIA, benchmark
+from .score import official
+
+__all__ = ["judge", "leaderboard", "markdown", "published"]
+
+# What the boards show for the classical controllers: performance and robustness.
+CLASSICAL = {
+    "acrobot": {
+        "TVLQR": (0.504, 0.607),
+        "iLQR MPC": (0.345, 0.343),
+        "iLQR Riccati gains": (0.396, 0.138),
+    },
+    "pendubot": {
+        "TVLQR": (0.526, 0.767),
+        "iLQR MPC": (0.353, 0.674),
+        "iLQR Riccati gains": (0.536, 0.255),
+    },
+}
+# Robustness of the learned ones whose performance ``report.PUBLISHED`` has.
+LEARNED_ROBUSTNESS = {
+    "acrobot": {"Evolutionary SAC": 0.692, "HistorySAC": 0.751},
+    "pendubot": {"Evolutionary SAC": 0.796, "AR-EAPO": 0.913},
+}
+HEADINGS = {
+    "swingup_time": ("swing-up [s]", ".2f"),
+    "energy": ("energy [J]", ".2f"),
+    "tau_cost": ("torque cost [N²m²s]", ".2f"),
+    "tau_smoothness": ("smoothness [N m]", ".4f"),
+    "velocity_cost": ("velocity cost [rad²/s]", ".1f"),
+}
+# Headings for a terminal, in the order of ``HEADINGS`` and of ``CRITERIA``.
+SHORT = ("up s", "J", "torque²", "steps", "speed²")
+SHORT_ROBUSTNESS = ("model", "vel.", "torque", "resp.", "delay", "pulses")
+
+
+def published(robot: str) -> list[dict[str, Any]]:
+    """The rows of the boards: title, score and robustness (None where none is known)."""
+    learned = {
+        name: (score, LEARNED_ROBUSTNESS[robot].get(name))
+        for name, score in report.PUBLISHED[robot].items()
+    }
+    return [
+        {"title": title, "source": "published", "score": score, "robustness": robustness}
+        for title, (score, robustness) in (learned | CLASSICAL[robot]).items()
+    ]
+
+
+def judge(
+    make, robot: str, *, robustness: bool = True, keys: int = 1, seed: int = 0
+) -> dict[str, Any]:
+    """Performance (float64) and robustness (float32) of a controller, as plain numbers.
+
+    Args:
+        make: called as ``make(plant)`` under either precision; gives the controller.
+        robot: "acrobot" or "pendubot".
+        robustness: run the benchmark too: seconds for a feedback law, minutes for MPC.
+        keys, seed: of ``robustness.benchmark``.
+    """
+    with jax.enable_x64(True):
+        result = official(make(designs.competition(robot)), robot)
+    result = {name: result[name] for name in ("score", "success", "criteria")}
+    if not robustness:
+        return result | {"robustness": None}
+    start = time.perf_counter()
+    with jax.enable_x64(False):
+        plant = designs.competition(robot)
+        found = benchmark(make(plant), plant, jax.random.key(seed), keys=keys)
+    return result | {
+        "robustness": found.overall,
+        "robustness_by_key": found.overall_by_key,
+        "robustness_criteria": found.scores,
+        "robustness_seconds": time.perf_counter() - start,
+    }
+
+
+def leaderboard(
+    robot: str,
+    controllers: Mapping[str, tuple[str, Any]],
+    *,
+    say=lambda line: None,
+    **options: Any,
+) -> dict[str, Any]:
+    """Judge controllers, and rank them with the published ones by performance.
+
+    Args:
+        robot: "acrobot" or "pendubot".
+        controllers: name -> (title, ``make(plant)``).
+        say: told what is being judged.
+        options: of ``judge``.
+    """
+    rows = []
+    for name, (title, make) in controllers.items():
+        say(f"judging {title} ...")
+        rows.append(
+            {"name": name, "title": title, "source": "measured"} | judge(make, robot, **options)
+        )
+    rows += published(robot)
+    return {"robot": robot, "rows": sorted(rows, key=lambda row: -row["score"])}
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    """A row as text: title, score, criteria, six robustness scores, robustness."""
+    shown = lambda value, form: "" if value is None else format(value, form)  # noqa: E731
+    criteria = row.get("criteria") if row.get("success") else None
+    criteria = criteria or dict.fromkeys(HEADINGS)
+    six = row.get("robustness_criteria") or dict.fromkeys(CRITERIA)
+    title = row["title"] + (" (published)" if row["source"] == "published" else "")
+    return [
+        title,
+        shown(row["score"], ".3f"),
+        *(shown(criteria[name], form) for name, (_, form) in HEADINGS.items()),
+        *(shown(six[name], ".2f") for name in CRITERIA),
+        shown(row["robustness"], ".3f"),
+    ]
+
+
+def _headings() -> list[str]:
+    criteria = [heading for heading, _ in HEADINGS.values()]
+    return ["controller", "score", *criteria, *CRITERIA.values(), "robustness"]
+
+
+def markdown(board: Mapping[str, Any]) -> str:
+    """The board as a Markdown table."""
+    headings = _headings()
+    lines = [headings, ["---"] + ["---:"] * (len(headings) - 1), *map(_cells, board["rows"])]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def _show(board: Mapping[str, Any]) -> None:
+    """Two tables that fit a terminal of 80 columns; robustness only if it was measured."""
+    from rich.table import Table
+
+    parts = {"performance v2 (float64)": ["score", *SHORT]}
+    if any(row["source"] == "measured" and row["robustness"] for row in board["rows"]):
+        parts["robustness v2"] = ["robust", *SHORT_ROBUSTNESS]
+    columns = ["score", *SHORT, *SHORT_ROBUSTNESS, "robust"]
+    for title, headings in parts.items():
+        table = Table(title=f"{board['robot']}: {title}", caption="* published")
+        for heading in ("controller", *headings):
+            justify = "left" if heading == "controller" else "right"
+            table.add_column(heading, justify=justify, no_wrap=True)
+        for row in board["rows"]:
+            cells = dict(zip(columns, _cells(row)[1:], strict=True))
+            style = "dim" if row["source"] == "published" else None
+            name = row["title"] + ("*" if row["source"] == "published" else "")
+            table.add_row(name, *(cells[heading] for heading in headings), style=style)
+        report.console.print(table)
+
+
+def _ships_policy(robot: str) -> bool:
+    try:
+        load_policy(robot)
+    except JaxpendError:
+        return False
+    return True
+
+
+def _chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[str, tuple]:
+    """Name -> (title, make) of what the command line asks for."""
+    if controllers is None:
+        names = [n for n in KNOWN if not n.startswith("policy") or _ships_policy(robot)]
+    else:
+        names = [name.strip() for name in controllers.split(",") if name.strip()]
+    chosen = {
+        name: (
+            KNOWN[choose("controller", name, KNOWN)].title,
+            lambda plant, name=name: build(name, plant, robot),
+        )
+        for name in names
+    }
+    if policy is not None:
+        own: Controller = load_policy(policy, robot=robot)
+        chosen["own_policy"] = (policy.stem, lambda plant: own)
+    return chosen
+
+
+def main(
+    robot: str = "pendubot",
+    controllers: str | None = None,
+    policy: Path | None = None,
+    robustness: bool = True,
+    keys: int = 1,
+    seed: int = 0,
+    json: str | None = None,
+    out: Path | None = None,
+) -> None:
+    """Judge controllers on performance and robustness, next to the published ones.
+
+    Args:
+        robot: acrobot or pendubot.
+        controllers: names separated by commas; by default all that are known.
+        policy: a policy file to judge as well.
+        robustness: False leaves the robustness benchmark out (minutes for MPC).
+        keys: repetitions of what the benchmark draws at random.
+        seed: of the benchmark's first key.
+        json: write the result as JSON to this file, or "-" for standard output.
+        out: write the table as Markdown to this file.
+    """
+    choose("robot", robot, designs.ROBOTS)
+    chosen = _chosen(controllers, policy, robot)
+    say = lambda line: report.console.print(line, style="dim")  # noqa: E731
+    options = {"robustness": robustness, "keys": keys, "seed": seed}
+    board = leaderboard(robot, chosen, say=say, **options)
+    _show(board)
+    cli.emit_json(board, json)
+    if out is not None:
+        write_atomically(out, markdown(board))
+
+
+if __name__ == "__main__":
+    cli.run(main, "jaxpend.leaderboard")
