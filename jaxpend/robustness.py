@@ -26,7 +26,7 @@ from .scenario import Pulses, Scenario
 from .sweep import compile_sweep, mildest_failure, survey, sweep
 from .variations import vary
 
-__all__ = ["CRITERIA", "Report", "Strip", "benchmark", "strips"]
+__all__ = ["CRITERIA", "Report", "Strip", "benchmark", "passes", "strips"]
 
 # The six criteria in the order of the boards, and their headings there.
 CRITERIA = {
@@ -122,20 +122,25 @@ class Report:
         }
 
 
-def _base(plant: Plant, draws: bool) -> Scenario:
-    """Nominal, with all that the criteria of one kind vary there at no strength.
+def passes(fraction: np.ndarray) -> np.ndarray:
+    """Whether a grid value counts as mastered: more than half of its repetitions, strictly."""
+    return np.asarray(fraction) > 0.5
+
+
+def _base(nominal: Scenario, draws: bool) -> Scenario:
+    """The nominal scenario, with all that criteria of one kind vary in it at no strength.
 
     One program for all criteria that draw something and one for all others: what the absent
     imperfections cost a run is little beside what six programs cost to compile.
     """
-    nominal = Scenario(plant)
     numbers = lambda value, *shape: np.full(shape, value, nominal.dtype)  # noqa: E731
-    if not draws:
-        return nominal.replace(delay=np.zeros(4, "i4"), responsiveness=numbers(1))
-    silent = Pulses(time=numbers(0, 2, 3), width=numbers(1, 2, 3), amplitude=numbers(0, 2, 3))
-    return nominal.replace(
-        measurement_noise=numbers(0, 4), torque_noise=numbers(0, 2), pulses=silent
-    )
+    neutral = {"delay": np.zeros(4, "i4"), "responsiveness": numbers(1)}
+    if draws:
+        silent = Pulses(numbers(0, 2, 3), numbers(1, 2, 3), numbers(0, 2, 3))
+        neutral = {"measurement_noise": numbers(0, 4), "torque_noise": numbers(0, 2)}
+        neutral |= {"pulses": silent}
+    absent = {name: v for name, v in neutral.items() if getattr(nominal, name) is None}
+    return nominal.replace(**absent)
 
 
 def _scenarios(base: Scenario, grids: Iterable[Strip], key: jax.Array, dt: float) -> Scenario:
@@ -177,7 +182,7 @@ def _compile(jobs: list[tuple], options: dict[str, Any]) -> float:
 
 def benchmark(
     controller: Controller,
-    plant: Plant,
+    scenario: Scenario | Plant,
     key: jax.Array,
     *,
     keys: int = 1,
@@ -191,8 +196,8 @@ def benchmark(
 
     Args:
         controller: any controller; a ``PythonLaw`` for one that is not written in jax.
-        plant: the nominal plant, such as ``designs.competition(robot)``; its type is the
-            precision.
+        scenario: the nominal plant, such as ``designs.competition(robot)``, or a scenario with
+            more that goes wrong in every run; its type is the precision.
         key: split per key, criterion, scenario and run.
         keys: how often the criteria that draw something (noise, disturbances) are repeated.
         scored: the mean v2 performance score at every grid value too.
@@ -205,14 +210,15 @@ def benchmark(
     """
     if keys < 1:
         raise JaxpendError(f"keys is {keys}; it must be at least 1")
-    grids = strips(plant) if grids is None else grids
+    nominal = Scenario(scenario) if isinstance(scenario, Plant) else scenario
+    grids = strips(nominal.plant) if grids is None else grids
     options = {"scored": scored, "dt": dt, "duration": duration, "chunk": chunk}
     jobs = {}
     for draws in (False, True):
         rows = [s for s in grids if (s.criterion in RANDOM) == draws]
         for number in range(keys if draws else 1) if rows else ():
             draw_key, run_key = jax.random.split(jax.random.fold_in(key, number))
-            scenarios = _scenarios(_base(plant, draws), rows, draw_key, dt)
+            scenarios = _scenarios(_base(nominal, draws), rows, draw_key, dt)
             jobs[draws, number] = (scenarios, controller, run_key)
     compile_seconds = _compile([job for (_, number), job in jobs.items() if number == 0], options)
     start = time.perf_counter()
@@ -233,7 +239,7 @@ def _report(grids, outcomes, keys, compile_seconds, run_seconds) -> Report:
 
     def scores(success: dict[str, np.ndarray]) -> dict[str, float]:
         of = {c: [success[s.variation] for s in grids if s.criterion == c] for c in CRITERIA}
-        return {c: float(np.mean(np.concatenate(f) > 0.5)) for c, f in of.items() if f}
+        return {c: float(np.mean(passes(np.concatenate(f)))) for c, f in of.items() if f}
 
     success = [of_key(number, "success") for number in range(keys)]
     by_key = [scores(s) for s in success]

@@ -49,7 +49,8 @@ def _plant(field: str, index: int | None = None, per: tuple[str, int] | None = N
         plant = scenario.plant
         if per is not None:
             values = values / getattr(plant, per[0])[:, per[1]]
-        changed = np.array(getattr(plant, field))
+        old = getattr(plant, field)
+        changed = np.zeros((len(values), 2), scenario.dtype) if old is None else np.array(old)
         changed[... if index is None else (slice(None), index)] = values
         return scenario.replace(plant=plant.replace(**{field: changed}))
 

@@ -5,6 +5,7 @@ full float64 precision; what is thinned out is time (closed loops keep every n-t
 an error anywhere shows in all that follow) and, for the synthetic trajectories, the cases.
 """
 
+import json
 import sys
 from pathlib import Path
 
@@ -83,8 +84,21 @@ def metrics(golden):
     return series | {name: golden[name][cases] for name in names}
 
 
+def robustness(golden):
+    """The grids and counts of the robustness benchmark, all of them."""
+    grids = golden["model_parameter_grids"] | {
+        "velocity_noise": golden["velocity_noise"]["sigma_velocity_grid"],
+        "torque_noise": golden["torque_noise"]["sigma_grid"],
+        "responsiveness": golden["torque_responsiveness_grid"],
+        "delay": golden["delay"]["grid"],
+    }
+    return {"grids": grids, "n_simulations": golden["n_simulations"]}
+
+
 def main(folder: Path) -> None:
     """Write every excerpt."""
+    grids = robustness(json.loads((folder / "robustness_grid.json").read_text()))
+    (HERE / "robustness_grid.json").write_text(json.dumps(grids, indent=1) + "\n")
     cuts = {"dynamics": dynamics, "metrics_random": metrics}
     for robot in ROBOTS:
         cuts[f"trajectories_{robot}"] = trajectories
