@@ -66,7 +66,7 @@ def _parameters(plant, robot, goal, dt, weight, line_width, power_width):
     )  # fmt: skip
 
 
-def _stages(plant, robot, dt, stages, iterations, goal, u):
+def _stages(plant, robot, dt, stages, iterations, goal, u, mu=1.0):
     """All stages in turn on a batch of starts: goal (B, 4), u (B, N)."""
     base = _parameters(plant, robot, goal[0], dt, 1.0, 0.1, 0.1)
 
@@ -81,7 +81,9 @@ def _stages(plant, robot, dt, stages, iterations, goal, u):
             power_width=power_width,
         )
         limit = plant.torque_limit[p.joint]
-        return ilqr.solve(swingup.problem(), p, jnp.zeros(5), u, limit, iterations=iterations)
+        return ilqr.solve(
+            swingup.problem(), p, jnp.zeros(5), u, limit, iterations=iterations, mu=mu
+        )
 
     for stage in stages:
         solution = solve(goal, u, stage)
@@ -188,11 +190,12 @@ def find(robot: str, config: Search = Search(), *, say=lambda line: None):
     goal, labels, coarse = _coarse(plant, robot, config, say)
     best = np.array(_distinct(np.asarray(coarse.cost), config.keep, same=3 * SAME), int)
     goal, coarse = goal[best], jax.tree.map(lambda v: v[best], coarse)
+    # The regularisation may have grown at an optimum; gains to follow it with are those without.
+    coarse = _stages(plant, robot, COARSE_DT, LONG_STAGES[-1:], 1, goal, coarse.u, mu=0.01)
     say("refining: " + ", ".join(f"{1 - c:.4f}" for c in np.asarray(coarse.cost)))
     u = _refine(coarse, plant, round(COARSE_DT / FINE_DT), joint)
     fine = _stages(plant, robot, FINE_DT, FINE_STAGES, FINE_ITERATIONS, goal, u)
-    # The regularisation may have grown at the optimum; the gains to keep are those without it.
-    fine = _stages(plant, robot, FINE_DT, FINE_STAGES[-1:], 1, goal, fine.u)
+    fine = _stages(plant, robot, FINE_DT, FINE_STAGES[-1:], 1, goal, fine.u, mu=1e-8)
     gain = lqr(plant, robot, dt=FINE_DT).gain[joint]
     hold = round(config.hold / FINE_DT)
     z, held = _hold(fine.z[:, -1], goal, gain, plant, FINE_DT, hold, joint)
