@@ -134,9 +134,10 @@ def test_shapes_that_do_not_fit_are_one_sentence(t, x, u):
     assert "\n" not in str(error.value)
 
 
-def test_scoring_loads_no_training_library():
+@pytest.mark.parametrize("module", ["jaxpend.score", "jaxpend.robustness"])
+def test_judging_loads_no_training_library(module):
     heavy = {"brax", "flax", "optax", "evosax", "mujoco", "matplotlib", "scipy", "tyro", "rich"}
-    code = "import jax, sys; jax_alone = set(sys.modules); import jaxpend.score; "
+    code = f"import jax, sys; jax_alone = set(sys.modules); import {module}; "
     code += "print(*{name.split('.')[0] for name in set(sys.modules) - jax_alone})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
