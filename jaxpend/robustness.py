@@ -305,16 +305,21 @@ def _table(result: dict[str, Any], robot: str) -> None:
     for heading in ("", "score [%]", "over keys [%]", "diverged"):
         table.add_column(heading, justify="right" if heading else "left")
     over = result["over_keys"]
+    several = len(over["overall"]) > 1
     for name, title in CRITERIA.items():
-        drawn = over["scores"].get(name)
+        drawn = over["scores"].get(name) if several else None
         spread = f"{100 * min(drawn):.1f} to {100 * max(drawn):.1f}" if drawn else ""
         diverged = str(result["criteria"][name]["diverged"])
         table.add_row(title, f"{100 * result['scores'][name]:.1f}", spread, diverged)
-    spread = f"{100 * over['mean']:.1f} ± {100 * over['std']:.1f}"
+    spread = f"{100 * over['mean']:.1f} ± {100 * over['std']:.1f}" if several else ""
     table.add_row("Overall", f"[bold]{100 * result['overall']:.1f}[/bold]", spread, "")
     console.print(table)
-    seconds = f"{result['run_seconds']:.1f} s for {len(over['overall'])} keys"
+    seconds = f"{result['run_seconds']:.1f} s for {len(over['overall'])} key" + "s" * several
     console.print(f"{seconds}, compiled in {result['compile_seconds']:.1f} s", style="dim")
+    worst = result.get("worst")
+    if worst:
+        values = ", ".join(f"{k} = {v:.3g}" for k, v in (worst["values"] or {}).items())
+        console.print(f"{100 * worst['failures']:.1f} % of combined imperfections fail; {values}")
 
 
 def main(
