@@ -1,28 +1,30 @@
 """What every command shares: argument parsing, one-sentence errors, exit codes, JSON output."""
 
+import argparse
+import contextlib
 import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from .errors import JaxpendError
 from .files import write_atomically
 
-__all__ = ["emit_json", "run"]
+__all__ = ["configure", "emit_json", "guard", "run"]
+
+T = TypeVar("T")
 
 
-def run(main: Callable[..., None], prog: str) -> NoReturn:
-    """Parse the command line into ``main``'s parameters (tyro), call it, and exit.
+@contextlib.contextmanager
+def guard(prog: str) -> Iterator[None]:
+    """Turn what goes wrong in a command into one sentence on standard error and an exit code.
 
-    Exit code 2 and one sentence on standard error for a ``JaxpendError`` or an unusable file
-    system, 130 after Ctrl-C.
+    2 for a ``JaxpendError`` or an unusable file system, 130 after Ctrl-C.
     """
-    import tyro
-
     try:
-        tyro.cli(main, prog=prog, config=(tyro.conf.FlagConversionOff,))
+        yield
     except JaxpendError as error:
         print(f"{prog}: {error}", file=sys.stderr)
         sys.exit(2)
@@ -33,7 +35,37 @@ def run(main: Callable[..., None], prog: str) -> NoReturn:
     except KeyboardInterrupt:
         print(f"{prog}: interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def run(main: Callable[..., None], prog: str) -> NoReturn:
+    """Parse the command line into ``main``'s parameters (tyro), call it under ``guard``, exit."""
+    import tyro
+
+    with guard(prog):
+        tyro.cli(main, prog=prog, config=(tyro.conf.FlagConversionOff,))
     sys.exit(0)
+
+
+def configure(default: T, prog: str, description: str, also: Sequence[str] = ()) -> T:
+    """A configuration from the command line: ``--config FILE`` first, then any field over it.
+
+    Sections of the file named in ``also`` that this command has no field for are passed over, so
+    that one file serves several commands.
+
+    Raises:
+        JaxpendError: the file cannot be used, or it names an unknown field.
+    """
+    import tyro
+
+    from .runs import load_config
+
+    files = argparse.ArgumentParser(prog=prog, add_help=False, allow_abbrev=False)
+    files.add_argument("--config")
+    named, rest = files.parse_known_args()
+    if named.config:
+        default = load_config(default, named.config, also)
+    description += "\n\n--config FILE reads a YAML file first; the options below override it."
+    return tyro.cli(type(default), default=default, args=rest, prog=prog, description=description)
 
 
 def _plain(value: Any) -> Any:

@@ -1,14 +1,13 @@
 """What a policy sees of the state. One definition for training, rollouts and policy files."""
 
 import dataclasses
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
 from .errors import JaxpendError, choose
 
-__all__ = ["OBSERVATIONS", "Observation"]
+__all__ = ["KINDS", "Observation"]
 
 
 def _wrapped(x: jax.Array, max_velocity: float) -> jax.Array:
@@ -26,22 +25,7 @@ def _sincos(x: jax.Array, max_velocity: float) -> jax.Array:
     return jnp.concatenate([jnp.cos(angles), jnp.sin(angles), velocity / max_velocity])
 
 
-def _fine(x: jax.Array, max_velocity: float) -> jax.Array:
-    """``sincos`` plus a magnified view of the upright state.
-
-    Balancing happens within 0.1 rad and 1 rad/s of upright, a few percent of what ``sincos``
-    spans. The added terms resolve it and saturate elsewhere.
-    """
-    link2 = x[0] + x[1]
-    tilt = jnp.stack([-jnp.sin(x[0]), -jnp.sin(link2), jnp.sin(x[1])])
-    return jnp.concatenate([_sincos(x, max_velocity), jnp.tanh(4 * tilt), jnp.tanh(x[2:4] / 2)])
-
-
-OBSERVATIONS: dict[str, tuple[Callable, int]] = {
-    "wrapped": (_wrapped, 4),
-    "sincos": (_sincos, 6),
-    "fine": (_fine, 11),
-}
+KINDS = {"wrapped": (_wrapped, 4), "sincos": (_sincos, 6)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,15 +39,15 @@ class Observation:
     max_velocity: float = 20.0  # rad/s, velocities are divided by it
 
     def __post_init__(self):
-        choose("observation kind", self.kind, OBSERVATIONS)
+        choose("observation kind", self.kind, KINDS)
         if not self.max_velocity > 0:
             raise JaxpendError(f"max_velocity is {self.max_velocity} rad/s; it must be positive")
 
     @property
     def size(self) -> int:
         """Length of the observation."""
-        return OBSERVATIONS[self.kind][1]
+        return KINDS[self.kind][1]
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """Observation of one state."""
-        return OBSERVATIONS[self.kind][0](x, self.max_velocity)
+        return KINDS[self.kind][0](x, self.max_velocity)

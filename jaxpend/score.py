@@ -9,8 +9,10 @@ import jax
 import jax.numpy as jnp
 
 from ._struct import pytree
+from .controllers.base import Controller
 from .errors import JaxpendError
 from .plant import Plant
+from .rollout import rollout
 
 __all__ = [
     "V1_DEFAULT",
@@ -19,6 +21,7 @@ __all__ = [
     "V2_OFFICIAL",
     "Criteria",
     "criteria",
+    "performance",
     "score_v1",
     "score_v2",
     "score_v3",
@@ -135,6 +138,12 @@ def criteria(
     )
 
 
+def performance(controller: Controller, plant: Plant, key: jax.Array) -> Criteria:
+    """Criteria of the official run: the nominal plant, 10 s at 500 Hz from hanging."""
+    run = rollout(plant, controller, key)
+    return criteria(run.t, run.x, run.u, plant)
+
+
 def score_v1(c: Criteria, terms: dict[str, tuple[float, float]] = V1_OFFICIAL) -> jax.Array:
     """``success (1 - sum_i w_i c_i / n_i)``; NaN, as there, where the trajectory was too short."""
     cost = sum(weight * getattr(c, name) / norm for name, (weight, norm) in terms.items())
@@ -151,3 +160,46 @@ def score_v2(c: Criteria, norms: dict[str, float] = V2_OFFICIAL) -> jax.Array:
 def score_v3(c: Criteria, t_final: float = 60.0) -> jax.Array:
     """``uptime / t_final``; the leaderboard's runs last 60 s."""
     return c.uptime / t_final
+
+
+def main(robot: str = "pendubot", policy: str | None = None, json: str | None = None) -> None:
+    """Official v2 score of a policy, in float64.
+
+    Args:
+        robot: acrobot or pendubot.
+        policy: a policy file; by default the one that ships with the package.
+        json: write the result as JSON to this file, or "-" for standard output.
+    """
+    from . import cli, designs
+    from .controllers.policy import load_policy, read_header
+    from .report import score_table
+
+    designs.active_joint(robot)
+    loaded = load_policy(policy or robot, robot=robot)
+    header = read_header(policy or robot)
+    result = official(loaded, robot) | {"policy": policy or robot, "header": header}
+    if json != "-":
+        score_table({str(policy or f"shipped {robot}"): result}, robot)
+    cli.emit_json(result, json)
+
+
+def official(controller: Controller, robot: str) -> dict:
+    """Score, success and criteria of a controller as plain numbers, computed in float64."""
+    from .designs import competition
+
+    with jax.enable_x64(True):
+        run = jax.jit(lambda c: performance(c, competition(robot), jax.random.key(0)))
+        c = run(controller)
+        names = [name for name in vars(c) if name != "success"]
+        return {
+            "robot": robot,
+            "score": float(score_v2(c)),
+            "success": bool(c.success),
+            "criteria": {name: float(getattr(c, name)) for name in names},
+        }
+
+
+if __name__ == "__main__":
+    from .cli import run
+
+    run(main, "jaxpend.score")

@@ -91,7 +91,7 @@ def from_dict(
         coulomb_friction=pair("cf"), torque_limit=limit, actuation=np.asarray(actuation, float),
         gravity=np.array(p["g"]), motor_inertia=np.array(p["Ir"]), gear_ratio=np.array(p["gr"]),
     )  # fmt: skip
-    # numpy, not jax, arrays: they stay known constants where they are made inside a jitted function.
+    # numpy, not jax, arrays: made inside a jitted function, they are still known constants.
     return Plant(**{k: np.asarray(v, jnp.result_type(float)) for k, v in vars(values).items()})
 
 

@@ -1,0 +1,49 @@
+# `make` alone lists what there is. Variables: ROBOT, SEED, RUN (name of the run), ARGS.
+ROBOT ?= pendubot
+SEED ?= 0
+RUN ?= $(ROBOT)-seed$(SEED)
+ARGS ?=
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help install train snes score test lint bench clean
+
+help:  ## list the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@echo
+	@echo "variables: ROBOT=acrobot|pendubot  SEED=0  RUN=name  ARGS='--sac.steps 100000'"
+
+$(STAMP): pyproject.toml .constraints.txt
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and \
+	  f"jaxpend needs Python 3.11 or newer, not {v[0]}.{v[1]}: make PYTHON=/path/to/python3")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c .constraints.txt -e '.[dev]'
+	@touch $@
+
+install: $(STAMP)  ## make .venv with pinned versions
+
+train: $(STAMP)  ## SAC, then SNES, for ROBOT; ends with the official score
+	$(BIN)/python -m jaxpend.train --config experiments/$(ROBOT).yaml --seed $(SEED) --run $(RUN) $(ARGS)
+
+snes: $(STAMP)  ## fine-tune a policy by SNES: ARGS='--policy FILE'
+	$(BIN)/python -m jaxpend.snes --robot $(ROBOT) --seed $(SEED) $(ARGS)
+
+score: $(STAMP)  ## official score of the shipped policy, or ARGS='--policy FILE'
+	$(BIN)/python -m jaxpend.score --robot $(ROBOT) $(ARGS)
+
+test: $(STAMP)  ## the test suite
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(STAMP)  ## ruff: rules and format
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+bench: $(STAMP)  ## time rollouts, SAC and SNES on this machine
+	$(BIN)/python experiments/bench.py $(ARGS)
+
+clean:  ## remove the virtual environment and caches; runs/ stays
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis build *.egg-info
+	find jaxpend tests experiments -name __pycache__ -type d -exec rm -rf {} +

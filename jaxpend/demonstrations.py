@@ -1,0 +1,145 @@
+"""Demonstrations of an optimised swing-up, for imitation and for SAC's replay buffer.
+
+The shipped swing-up, stabilised by TVLQR, is run under noise in the learning environment. The
+label of a row is the action the controller wanted, not the disturbed one it got, so that a
+policy that imitates it learns to return from where noise leads (Laskey et al., "DART: noise
+injection for robust imitation learning", 2017).
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from . import designs
+from .controllers.base import Controller
+from .env import DoublePendulum
+from .errors import JaxpendError
+from .networks import Actor
+
+__all__ = ["DemonstrationConfig", "collect", "imitate", "swingups"]
+
+SATURATED = 0.99  # of the torque limit
+
+
+@dataclasses.dataclass(frozen=True)
+class DemonstrationConfig:
+    """How demonstrations are made and imitated.
+
+    Each episode scales all its noise by its own s^2, s uniform in [0, 1].
+    """
+
+    episodes: int = 0  # 0: no demonstrations, learn from the reward alone
+    duration: float = 4.0  # s an episode
+    action_noise: float = 0.3  # largest standard deviation, of the normalised action
+    kicks: float = 0.1  # rad/s, largest standard deviation of velocity jumps between steps
+    start_spread: float = 0.1  # rad and rad/s, largest standard deviation of the initial state
+    updates: int = 20_000  # imitation updates of the actor before SAC
+    batch_size: int = 1024
+    learning_rate: float = 2e-3  # cosine decay to a thousandth
+    log_std: float = -2.5  # of the actor that SAC starts with, before the tanh
+
+    def __post_init__(self):
+        if self.episodes < 0:
+            raise JaxpendError(f"episodes is {self.episodes}; it must not be negative")
+        for name in ("duration", "updates", "batch_size", "learning_rate"):
+            if not getattr(self, name) > 0:
+                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
+
+
+def collect(
+    config: DemonstrationConfig,
+    env: DoublePendulum,
+    controller: Controller,
+    key: jax.Array,
+    *,
+    reward_scale: float,
+) -> tuple[jax.Array, jax.Array]:
+    """Run a controller, called at the environment's control period, under noise.
+
+    Returns replay rows (n, sac.ROW), every one an exact transition (velocity jumps fall between
+    rows), and the wanted actions (n,). Rows in which the controller wants all the torque there is
+    are left out: it has lost the swing-up there and has nothing to teach. ``key`` is consumed.
+
+    Raises:
+        JaxpendError: nothing is left.
+    """
+    joint, limit = designs.active_joint(env.config.robot), env.config.torque_limit
+    steps = round(config.duration / env.config.dt)
+
+    def episode(key):
+        key_level, key_start, key_controller, key_action, key_kick = jax.random.split(key, 5)
+        level = jax.random.uniform(key_level) ** 2
+        x = level * config.start_spread * jax.random.normal(key_start, (4,))
+        noise = level * config.action_noise * jax.random.normal(key_action, (steps,))
+        kicks = level * config.kicks * jax.random.normal(key_kick, (steps, 2))
+
+        def step(carry, now):
+            x, previous, memory = carry
+            k, disturbance, kick = now
+            memory, torque = controller(memory, k * env.config.dt, x)
+            wanted = jnp.clip(torque[joint] / limit, -1.0, 1.0)
+            action = jnp.clip(wanted + disturbance, -1.0, 1.0)
+            x_next, reward = env.advance(x, previous, action)
+            row = jnp.concatenate([x, jnp.stack([previous, action, reward_scale * reward]), x_next])
+            return (x_next.at[2:].add(kick), action, memory), (row, wanted)
+
+        start = (x, jnp.zeros(()), controller.reset(key_controller))
+        return jax.lax.scan(step, start, (jnp.arange(steps), noise, kicks))[1]
+
+    rows, wanted = jax.jit(jax.vmap(episode))(jax.random.split(key, config.episodes))
+    rows, wanted = rows.reshape(-1, rows.shape[-1]), wanted.reshape(-1)
+    teaches = np.abs(np.asarray(wanted)) < SATURATED
+    if not teaches.any():
+        raise JaxpendError("the demonstrating controller asks for all the torque all the time")
+    return rows[teaches], wanted[teaches]
+
+
+def swingups(
+    config: DemonstrationConfig, env: DoublePendulum, key: jax.Array, *, reward_scale: float
+) -> tuple[jax.Array, jax.Array]:
+    """``collect`` with the shipped swing-up of the environment's robot under TVLQR."""
+    from .controllers import load_nominal, tvlqr  # loads scipy
+
+    controller = tvlqr(env.plant, load_nominal(env.config.robot), r=10.0)
+    return collect(config, env, controller, key, reward_scale=reward_scale)
+
+
+@partial(jax.jit, static_argnames=("config", "actor", "observe"))
+def imitate(
+    config: DemonstrationConfig,
+    actor: Actor,
+    observe: Callable,
+    params: dict,
+    rows: jax.Array,
+    wanted: jax.Array,
+    key: jax.Array,
+) -> tuple[dict, jax.Array]:
+    """Fit the actor's greedy action to the wanted ones; returns parameters and the last losses.
+
+    Minimises the mean squared error of tanh(mean). ``observe`` maps a state (4,) and the previous
+    action () to an observation. ``key`` is consumed.
+    """
+    schedule = optax.cosine_decay_schedule(config.learning_rate, config.updates, 1e-3)
+    optimizer = optax.adam(schedule)
+    obs = jax.vmap(observe)(rows[:, :4], rows[:, 4])
+
+    def step(carry, key):
+        params, opt_state = carry
+        index = jax.random.randint(key, (config.batch_size,), 0, rows.shape[0])
+
+        def loss(params):
+            mean, _ = actor.apply(params, obs[index])
+            return jnp.mean((jnp.tanh(mean[:, 0]) - wanted[index]) ** 2)
+
+        error, grads = jax.value_and_grad(loss)(params)
+        updates, opt_state = optimizer.update(grads, opt_state)
+        return (optax.apply_updates(params, updates), opt_state), error
+
+    start = (params, optimizer.init(params))
+    (params, _), errors = jax.lax.scan(step, start, jax.random.split(key, config.updates))
+    return params, errors[-100:].mean()

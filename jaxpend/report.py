@@ -1,0 +1,81 @@
+"""What people read on the terminal: score tables and live progress."""
+
+import time
+from collections.abc import Mapping
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+__all__ = ["PUBLISHED", "LiveProgress", "console", "score_table"]
+
+# Progress and tables go to standard error, so that standard output stays machine-readable.
+console = Console(stderr=True)
+
+# Performance scores on the v2 boards, as published (arXiv 2409.08938 and the boards).
+PUBLISHED = {
+    "acrobot": {"Evolutionary SAC": 0.524, "HistorySAC": 0.655, "AR-EAPO": 0.633},
+    "pendubot": {"Evolutionary SAC": 0.596, "HistorySAC": 0.682, "AR-EAPO": 0.659},
+}
+_ROWS = {
+    "swingup_time": ("swing-up time [s]", ".3f"),
+    "energy": ("energy [J]", ".2f"),
+    "tau_cost": ("torque cost [N²m²s]", ".2f"),
+    "tau_smoothness": ("torque smoothness [N m]", ".4f"),
+    "velocity_cost": ("velocity cost [rad²/s]", ".1f"),
+}
+
+
+def score_table(results: Mapping[str, Mapping], robot: str) -> None:
+    """Print official results (``score.official``), a column each, and the published scores."""
+    table = Table(title=f"{robot}: official v2 score (float64)")
+    table.add_column("")
+    for name in results:
+        table.add_column(name, justify="right")
+    table.add_row("score", *(f"[bold]{r['score']:.4f}[/bold]" for r in results.values()))
+    table.add_row("success", *("yes" if r["success"] else "no" for r in results.values()))
+    for key, (heading, form) in _ROWS.items():
+        table.add_row(heading, *(format(r["criteria"][key], form) for r in results.values()))
+    console.print(table)
+    published = ", ".join(f"{name} {score:.3f}" for name, score in PUBLISHED[robot].items())
+    console.print(f"published: {published}", style="dim")
+
+
+class LiveProgress:
+    """A progress bar on a terminal, a line per report elsewhere. Use it as a context manager.
+
+    Until the first report it says what is going on (compilation, mostly), so that this is not
+    mistaken for a hang; the time left is estimated from then on.
+    """
+
+    def __init__(self, title: str, total: int, note: str = "compiling ..."):
+        self.title, self.total, self.started = title, total, time.perf_counter()
+        self.bar = Progress(
+            TextColumn("[bold]{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self.task = self.bar.add_task(title, total=total, note=note)
+        self.note = note
+
+    def __enter__(self):
+        self.bar.__enter__()
+        if not console.is_terminal:
+            console.print(f"{self.title}: {self.note}", highlight=False)
+        return self
+
+    def __exit__(self, *exception):
+        self.bar.__exit__(*exception)
+
+    def report(self, done: int, note: str) -> None:
+        """Say that ``done`` of the total is done, and what came of it."""
+        self.bar.update(self.task, completed=done, note=note)
+        if not console.is_terminal:
+            seconds = time.perf_counter() - self.started
+            line = f"{self.title} {done:,}/{self.total:,}  {seconds:.0f} s  {note}"
+            console.print(line, highlight=False, soft_wrap=True)

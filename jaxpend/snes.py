@@ -1,0 +1,143 @@
+"""Separable natural evolution strategy on a policy's parameters against the official score.
+
+SNES (Wierstra et al., "Natural evolution strategies", JMLR 2014; evosax) starts from a trained
+policy. The fitness of an individual is its official v2 score (10 s at 500 Hz), averaged over
+rollouts whose greedy action is un-squashed, disturbed by Gaussian noise and squashed again
+(Calì et al., 2024), so that what is found stands on wide ground. All individuals of a
+generation meet the same noise: common random numbers make the comparison fair.
+"""
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from evosax.algorithms import SNES
+from jax.flatten_util import ravel_pytree
+
+from . import designs
+from ._struct import pytree
+from .controllers.policy import Policy
+from .errors import JaxpendError, choose
+from .score import performance, score_v2
+
+__all__ = ["SNESConfig", "SNESState", "evolve", "fitness", "init"]
+
+SEARCHED = ("all", "hidden")
+
+
+@dataclasses.dataclass(frozen=True)
+class SNESConfig:
+    """Hyperparameters of the evolution strategy."""
+
+    generations: int = 400
+    population: int = 40
+    sigma: float = 0.01  # initial standard deviation of the parameters
+    final_sigma: float = 1.0  # sigma decays geometrically to this fraction of itself
+    searched: str = "all"  # "all" parameters, or "hidden": all but the output layer
+    rollouts: int = 1  # noisy rollouts per individual
+    action_noise: float = 0.1  # standard deviation before the tanh; 0 for none
+    chunk: int = 10  # generations per report
+
+    def __post_init__(self):
+        choose("choice of searched parameters", self.searched, SEARCHED)
+        for name in ("generations", "population", "sigma", "final_sigma", "rollouts", "chunk"):
+            if not getattr(self, name) > 0:
+                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
+        if not self.action_noise >= 0:
+            raise JaxpendError(f"action_noise is {self.action_noise}; it must not be negative")
+        if self.population < 2:
+            raise JaxpendError("population is 1; SNES compares at least two individuals")
+
+
+@pytree
+class SNESState:
+    """Everything that the search changes."""
+
+    strategy: Any  # evosax state: mean and std (parameters,), generation counter
+    key: jax.Array
+    best: jax.Array  # (parameters,) best individual by noisy fitness
+    best_fitness: jax.Array  # () its noisy fitness, a score
+    diverged: jax.Array  # () int, rollouts that were not finite, so far
+
+
+def split_parameters(config: SNESConfig, policy: Policy):
+    """The searched parameters as a flat vector, and the function that puts them back."""
+    kept = policy.layers[-1:] if config.searched == "hidden" else ()
+    searched = policy.layers[: len(policy.layers) - len(kept)]
+    flat, unravel = ravel_pytree(searched)
+    return flat, lambda vector: policy.replace(layers=(*unravel(vector), *kept))
+
+
+def fitness(config: SNESConfig, policy: Policy, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean v2 score over noisy rollouts (to be maximised), and how many of them diverged."""
+    noise = jnp.asarray(config.action_noise, jnp.float32) if config.action_noise else None
+    noisy = policy.replace(action_noise=noise)
+    count = config.rollouts if config.action_noise else 1
+    plant = designs.competition(policy.robot)
+    c = jax.vmap(lambda k: performance(noisy, plant, k))(jax.random.split(key, count))
+    # A diverged rollout has score 0 already; its velocity says that it diverged.
+    return score_v2(c).mean(), jnp.sum(~jnp.isfinite(c.velocity_cost))
+
+
+def _strategy(config: SNESConfig, policy: Policy):
+    flat, rebuild = split_parameters(config, policy)
+    return SNES(population_size=config.population, solution=flat), flat, rebuild
+
+
+def init(config: SNESConfig, policy: Policy, key: jax.Array) -> SNESState:
+    """Search distribution centred on the policy."""
+    strategy, flat, _ = _strategy(config, policy)
+    key, key_init = jax.random.split(key)
+    params = strategy.default_params.replace(std_init=jnp.asarray(config.sigma, flat.dtype))
+    state = strategy.init(key_init, flat, params)
+    return SNESState(state, key, flat, jnp.asarray(-jnp.inf), jnp.zeros((), jnp.int32))
+
+
+@partial(jax.jit, static_argnames=("config", "generations"))
+def evolve(config: SNESConfig, policy: Policy, state: SNESState, generations: int):
+    """Run some generations; returns the state and per-generation metrics (generations,).
+
+    ``policy`` gives the parameters that are not searched, and the form of those that are.
+    """
+    strategy, _, rebuild = _strategy(config, policy)
+    params = strategy.default_params
+    decay = config.final_sigma ** (1.0 / config.generations)
+
+    def generation(state, _):
+        key, key_ask, key_noise, key_tell = jax.random.split(state.key, 4)
+        population, inner = strategy.ask(key_ask, state.strategy, params)
+        scores, diverged = jax.vmap(lambda p: fitness(config, rebuild(p), key_noise))(population)
+        # The one place that negates: evosax minimises.
+        inner, _ = strategy.tell(key_tell, population, -scores, inner, params)
+        inner = inner.replace(std=inner.std * decay)
+        top = jnp.argmax(scores)
+        better = scores[top] > state.best_fitness
+        state = SNESState(
+            strategy=inner,
+            key=key,
+            best=jnp.where(better, population[top], state.best),
+            best_fitness=jnp.maximum(scores[top], state.best_fitness),
+            diverged=state.diverged + diverged.sum(),
+        )
+        metrics = {"mean_fitness": scores.mean(), "max_fitness": scores[top]}
+        return state, metrics | {"sigma": inner.std.mean()}
+
+    return jax.lax.scan(generation, state, length=generations)
+
+
+def mean_policy(config: SNESConfig, policy: Policy, state: SNESState) -> Policy:
+    """The policy at the centre of the search distribution."""
+    return split_parameters(config, policy)[1](state.strategy.mean)
+
+
+def best_policy(config: SNESConfig, policy: Policy, state: SNESState) -> Policy:
+    """The individual with the best noisy fitness so far."""
+    return split_parameters(config, policy)[1](state.best)
+
+
+if __name__ == "__main__":
+    from .train import SNESRun, command
+
+    command(SNESRun, "jaxpend.snes", "SNES on the official score, from a policy file.")

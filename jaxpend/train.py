@@ -1,0 +1,190 @@
+"""The whole job: SAC on the surrogate reward, then SNES on the official score, in a run folder."""
+
+import dataclasses
+import math
+import time
+from pathlib import Path
+
+import jax
+
+from . import cli, designs, sac, snes
+from .controllers.policy import Policy, load_policy
+from .errors import JaxpendError
+from .report import LiveProgress, console, score_table
+from .runs import RunFolder
+from .sac import SACConfig
+from .score import official, performance, score_v2
+from .snes import SNESConfig
+
+__all__ = ["Run", "SACRun", "SNESRun", "TrainRun", "train", "train_sac", "train_snes"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What every training run has. Raises ``JaxpendError`` for an unknown robot."""
+
+    robot: str = "pendubot"
+    seed: int = 0
+    run: str = ""  # name of the run folder; empty: ROBOT-seedSEED
+    runs: str = "runs"  # folder of the run folders
+
+    def __post_init__(self):
+        designs.active_joint(self.robot)
+        if hasattr(self, "sac"):
+            changed = self.sac.for_robot(self.robot)
+            object.__setattr__(self, "sac", changed)
+
+    @property
+    def folder(self) -> Path:
+        """Path of the run folder."""
+        return Path(self.runs) / (self.run or f"{self.robot}-seed{self.seed}")
+
+
+@dataclasses.dataclass(frozen=True)
+class SACRun(Run):
+    """SAC alone."""
+
+    sac: SACConfig = dataclasses.field(default_factory=SACConfig)
+
+
+@dataclasses.dataclass(frozen=True)
+class SNESRun(Run):
+    """SNES alone, from a policy file."""
+
+    policy: str = ""  # where to start; empty: the policy that ships with the package
+    snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainRun(SACRun):
+    """SAC, then SNES from its best policy."""
+
+    snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
+
+
+@jax.jit
+def _nominal(policy: Policy):
+    """Score and criteria of the official run in the training precision."""
+    c = performance(policy, designs.competition(policy.robot), jax.random.key(0))
+    return score_v2(c), c
+
+
+def train_sac(config: SACConfig, seed: int, folder: RunFolder) -> Policy:
+    """Train SAC; returns the policy with the best official score, and leaves it and the last one.
+
+    ``sac_best.npz`` is on disk from the start, so that an interrupt loses nothing.
+
+    Raises:
+        JaxpendError: training diverged; the best policy so far stays on disk.
+    """
+    steps = max(config.eval_every // config.num_envs, 1)
+    imitates = "imitating demonstrations, " if config.demonstrations.episodes else ""
+    with LiveProgress("SAC", config.steps, f"{imitates}compiling ...") as progress:
+        state = sac.init(config, jax.random.key(seed))
+        best = sac.greedy_policy(config, state)
+        best_score = float(_nominal(best)[0])
+        folder.log("sac", env_steps=0, updates=0, score=best_score)
+        folder.save("sac_best.npz", best, stage="sac", env_steps=0, seed=seed)
+        while int(state.env_steps) < config.steps:
+            state, metrics = sac.train_chunk(config, state, steps)
+            policy = sac.greedy_policy(config, state)
+            score, c = _nominal(policy)
+            env_steps, score = int(state.env_steps), float(score)
+            counts = {"env_steps": env_steps, "updates": int(state.updates)}
+            folder.log("sac", **counts, score=score, uptime=c.uptime, **metrics)
+            if not all(math.isfinite(float(v)) for v in metrics.values()):
+                raise JaxpendError(
+                    f"SAC diverged after {env_steps:,} steps; the best policy before that is "
+                    f"{folder.path}/sac_best.npz; a lower sac.learning-rate may help"
+                )
+            # Ties happen before the first success: the later policy has learned more.
+            if score >= best_score:
+                best, best_score = policy, score
+                folder.save("sac_best.npz", policy, stage="sac", env_steps=env_steps, seed=seed)
+            folder.save("sac_last.npz", policy, stage="sac", env_steps=env_steps, seed=seed)
+            note = f"reward {float(metrics['reward']):.2f}  score {score:.3f}"
+            progress.report(min(env_steps, config.steps), f"{note}  best {best_score:.3f}")
+    return best
+
+
+def train_snes(config: SNESConfig, start: Policy, seed: int, folder: RunFolder) -> Policy:
+    """Fine-tune a policy by SNES; returns the best seen by the official score, the start included.
+
+    Candidates are, at every report, the mean policy and the best individual so far, both scored
+    without noise and, for ``metrics.jsonl``, on fresh noise. ``snes_best.npz`` is on disk from
+    the start.
+    """
+    key_init, key_fresh = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
+    state = snes.init(config, start, key_init)
+    fresh_fitness = jax.jit(lambda policy, key: snes.fitness(config, policy, key)[0])
+    best, best_score, done = start, float(_nominal(start)[0]), 0
+    folder.save("snes_best.npz", best, stage="snes", generation=0, seed=seed)
+    with LiveProgress("SNES", config.generations) as progress:
+        while done < config.generations:
+            count = min(config.chunk, config.generations - done)
+            state, metrics = snes.evolve(config, start, state, count)
+            done += count
+            key_fresh, key_now = jax.random.split(key_fresh)
+            row = {name: values[-1] for name, values in metrics.items()}
+            candidates = {
+                "mean": snes.mean_policy(config, start, state),
+                "individual": snes.best_policy(config, start, state),
+            }
+            for name, policy in candidates.items():
+                score = float(_nominal(policy)[0])
+                row[f"{name}_score"] = score
+                row[f"{name}_fresh_fitness"] = fresh_fitness(policy, key_now)
+                if score > best_score:
+                    best, best_score = policy, score
+                    folder.save("snes_best.npz", policy, stage="snes", generation=done, seed=seed)
+            folder.save(
+                "snes_last.npz", candidates["mean"], stage="snes", generation=done, seed=seed
+            )
+            folder.log("snes", generation=done, diverged=int(state.diverged), **row)
+            note = f"fitness {float(row['mean_fitness']):.3f}  mean {row['mean_score']:.4f}"
+            progress.report(done, f"{note}  best {best_score:.4f}")
+    return best
+
+
+def train(config: Run) -> dict:
+    """The stages that the configuration has; returns what ``result.json`` in its folder says.
+
+    The score of each stage is the official one, computed in float64.
+    """
+    policy = None
+    if isinstance(config, SNESRun):  # before the folder is made: a wrong file leaves nothing behind
+        policy = load_policy(config.policy or config.robot, robot=config.robot)
+    folder = RunFolder(config.folder, config)
+    result = {"robot": config.robot, "seed": config.seed}
+    if policy is not None:
+        result["start"] = official(policy, config.robot)
+    try:
+        for name, stage in {"sac": train_sac, "snes": train_snes}.items():
+            if not hasattr(config, name):
+                continue
+            started = time.perf_counter()
+            before = () if name == "sac" else (policy,)
+            policy = stage(getattr(config, name), *before, config.seed, folder)
+            seconds = round(time.perf_counter() - started, 1)
+            result[name] = official(policy, config.robot) | {"seconds": seconds}
+            result["score"] = result[name]["score"]
+    except KeyboardInterrupt:
+        console.print(f"stopped; the best policies so far are in [bold]{folder.path}[/bold]")
+        raise
+    folder.save("policy.npz", policy, seed=config.seed, score=result["score"])
+    folder.write_json("result.json", result)
+    return result
+
+
+def command(kind: type[Run], prog: str, description: str) -> None:
+    """A training command: configuration, run, score table, and where the results are."""
+    with cli.guard(prog):
+        config = cli.configure(kind(), prog, description, also=("policy", "sac", "snes"))
+        result = train(config)
+        stages = {"start": "start", "sac": "after SAC", "snes": "after SNES"}
+        score_table({stages[k]: result[k] for k in stages if k in result}, config.robot)
+        console.print(f"policy.npz, metrics and result are in [bold]{config.folder}[/bold]")
+
+
+if __name__ == "__main__":
+    command(TrainRun, "jaxpend.train", __doc__)
