@@ -108,14 +108,28 @@ class MPC:
         u = jnp.concatenate([plan.u[n:], self._torque(k + np.arange(h - n, h))])
         return plan.replace(z=z, u=u, gain=gain)
 
+    def _recover(self, plan: Solution, k, x, x_ref) -> tuple[Solution, jax.Array]:
+        """The plan, and ``x`` on its turn; a plan that lost the state is dropped.
+
+        Angles are measured modulo a turn or not; the plan knows on which turn it is, and where it
+        is lost, the reference does.
+        """
+        lost = ~(jnp.max(jnp.abs(deviation(x, plan.z[0, :4])[:2])) < 0.5 * jnp.pi)
+        expected = jnp.where(lost, x_ref, plan.z[0, :4])
+        anew = plan.replace(
+            z=jnp.zeros_like(plan.z),
+            u=self._torque(k + np.arange(self.horizon)),
+            gain=jnp.zeros_like(plan.gain),
+        )
+        plan = jax.tree.map(lambda new, old: jnp.where(lost, new, old), anew, plan)
+        return plan, expected + deviation(x, expected)
+
     def _optimise(self, plan: Solution, k, x, last) -> Solution:
         """The plan for the horizon from step ``k``, from the measured state ``x``."""
         window = self._window(k)
         limit = self.plant.torque_limit[self.joint]
         shifted = jax.tree.map(lambda a, b: jnp.where(k == 0, a, b), plan, self._shift(plan, k))
-        # Angles are measured modulo a turn or not; the plan knows on which turn it is.
-        expected = shifted.z[0, :4]
-        x = expected + deviation(x, expected)
+        shifted, x = self._recover(shifted, k, x, window.x_ref[0])
         start = warm_start(PROBLEM, window, jnp.append(x, last), shifted, limit, mu=1e-6)
 
         def improve(now, _):

@@ -1,0 +1,61 @@
+"""The leaderboard: rows, order, marks, errors; the judging itself is tested where it lives."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from jaxpend import JaxpendError, designs, leaderboard
+from jaxpend.controllers import Zero, load_nominal, tvlqr
+
+
+def test_measured_and_published_rows_in_one_order():
+    make = lambda plant: tvlqr(plant, load_nominal("pendubot"))  # noqa: E731
+    chosen = {"tvlqr": ("TVLQR", make), "zero": ("Nothing", lambda plant: Zero())}
+    board = leaderboard.leaderboard("pendubot", chosen, robustness=False)
+    scores = [row["score"] for row in board["rows"]]
+    assert scores == sorted(scores, reverse=True)
+    first, last = board["rows"][0], board["rows"][-1]
+    assert (first["title"], first["source"]) == ("TVLQR", "measured")
+    assert first["score"] >= 0.700
+    assert first["robustness"] is None
+    assert (last["title"], last["success"], last["score"]) == ("Nothing", False, 0.0)
+    published = {row["title"]: row for row in board["rows"] if row["source"] == "published"}
+    assert (published["TVLQR"]["score"], published["TVLQR"]["robustness"]) == (0.526, 0.767)
+    table = leaderboard.markdown(board).splitlines()
+    assert len({line.count("|") for line in table}) == 1
+    assert table[2].startswith("| TVLQR | 0.700 | 1.27 |")
+    assert any(line.startswith("| TVLQR (published) | 0.526 |") for line in table)
+
+
+def test_robustness_is_part_of_the_row(monkeypatch):
+    seen = {}
+
+    class Found:
+        overall, overall_by_key, scores = 0.5, [0.5, 0.6], {"model": 1.0}
+
+    def benchmark(controller, plant, key, *, keys):
+        seen.update(dtype=plant.mass.dtype, keys=keys)
+        return Found
+
+    monkeypatch.setattr(leaderboard, "benchmark", benchmark)
+    row = leaderboard.judge(lambda plant: Zero(), "acrobot", keys=2)
+    assert (row["robustness"], row["robustness_criteria"]) == (0.5, {"model": 1.0})
+    assert (str(seen["dtype"]), seen["keys"]) == ("float32", 2)
+
+
+@pytest.mark.parametrize("robot", designs.ROBOTS)
+def test_unknown_names_list_the_known_ones(robot):
+    with pytest.raises(JaxpendError, match=r"unknown controller 'foo'; known: .*tvlqr, mpc"):
+        leaderboard.main(robot=robot, controllers="tvlqr,foo")
+
+
+def test_command_prints_json_only_on_standard_output():
+    command = "-m jaxpend.leaderboard --robot acrobot --controllers tvlqr --robustness False"
+    command = [sys.executable, *command.split(), "--json", "-"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    rows = json.loads(done.stdout)["rows"]
+    assert rows[0]["name"] == "tvlqr"
+    assert rows[0]["criteria"]["tau_smoothness"] < 0.004
+    assert "* published" in done.stderr
