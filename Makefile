@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install train snes score test lint bench clean
+.PHONY: help install train snes score robustness leaderboard test lint bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -33,6 +33,12 @@ snes: $(STAMP)  ## fine-tune a policy by SNES: ARGS='--policy FILE'
 
 score: $(STAMP)  ## official score of the shipped policy, or ARGS='--policy FILE'
 	$(BIN)/python -m jaxpend.score --robot $(ROBOT) $(ARGS)
+
+robustness: $(STAMP)  ## six-criterion robustness of the shipped policy, or ARGS='--policy FILE'
+	$(BIN)/python -m jaxpend.robustness --robot $(ROBOT) --seed $(SEED) $(ARGS)
+
+leaderboard: $(STAMP)  ## every known controller on both boards, next to the published rows
+	$(BIN)/python -m jaxpend.leaderboard --robot $(ROBOT) $(ARGS)
 
 test: $(STAMP)  ## the test suite
 	$(BIN)/python -m pytest $(ARGS)

@@ -70,6 +70,10 @@ class EnvConfig:
         """Control steps in an episode."""
         return round(self.duration / self.dt)
 
+    def make(self) -> "DoublePendulum":
+        """The environment."""
+        return DoublePendulum(self)
+
 
 def surrogate_reward(plant, reward: Reward, x, action, previous_action) -> jax.Array:
     """Reward of arriving in state ``x`` (4,) by ``action`` (), after ``previous_action`` ().

@@ -15,7 +15,7 @@ import optax
 from ._struct import pytree
 from .controllers.policy import ACTIVATIONS, Policy
 from .demonstrations import DemonstrationConfig, imitate, swingups
-from .env import DoublePendulum, EnvConfig
+from .env import EnvConfig
 from .errors import JaxpendError, choose
 from .networks import Actor, TwinCritic, constant_log_std, sample_action, to_policy
 
@@ -131,7 +131,7 @@ def init(config: SACConfig, key: jax.Array) -> SACState:
     state, recipe = _fresh(config, key), config.demonstrations
     if not recipe.episodes:
         return state
-    env, (actor, _) = DoublePendulum(config.env), networks(config)
+    env, (actor, _) = config.env.make(), networks(config)
     rows, wanted = swingups(recipe, env, key_demonstrate, reward_scale=config.reward_scale)
     params = constant_log_std(state.actor, recipe.log_std)
     params, _ = imitate(recipe, actor, env.observe, params, rows, wanted, key_imitate)
@@ -141,7 +141,7 @@ def init(config: SACConfig, key: jax.Array) -> SACState:
 
 @partial(jax.jit, static_argnames="config")
 def _fresh(config: SACConfig, key: jax.Array) -> SACState:
-    env = DoublePendulum(config.env)
+    env = config.env.make()
     actor, critic = networks(config)
     key, key_actor, key_critic, key_env, key_time = jax.random.split(key, 5)
     obs, action = jnp.zeros(env.observation_size), jnp.zeros(1)
@@ -185,7 +185,7 @@ def update(config: SACConfig, state: SACState, batch: jax.Array, key: jax.Array)
     the target critics. The actor maximises the soft value under the critics, less the weighted
     distance to demonstrated actions.
     """
-    env, opt, (actor, critic_net) = DoublePendulum(config.env), optimizer(config), networks(config)
+    env, opt, (actor, critic_net) = config.env.make(), optimizer(config), networks(config)
     key_critic, key_actor = jax.random.split(key)
     x, previous, action, reward, next_x, wanted = jnp.split(batch, (4, 5, 6, 7, ROW), axis=1)
     observe = jax.vmap(env.observe)
@@ -236,7 +236,7 @@ def update(config: SACConfig, state: SACState, batch: jax.Array, key: jax.Array)
 
 def interact(config: SACConfig, state: SACState, key: jax.Array):
     """One step of every environment into the replay buffer; returns the mean reward too."""
-    env = DoublePendulum(config.env)
+    env = config.env.make()
     actor, _ = networks(config)
     key_action, key_uniform, key_reset = jax.random.split(key, 3)
     before = state.env_x
