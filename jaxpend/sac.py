@@ -322,8 +322,9 @@ def train_chunk(config: SACConfig, state: SACState, vector_steps: int):
 
 
 def greedy_policy(config: SACConfig, state: SACState) -> Policy:
-    """The deterministic policy as a ``Controller``."""
-    return to_policy(state.actor, networks(config)[0], config.env)
+    """The deterministic policy as a ``Controller``; its arrays outlive the (donated) state."""
+    actor = jax.tree.map(jnp.copy, state.actor)
+    return to_policy(actor, networks(config)[0], config.env)
 
 
 if __name__ == "__main__":
