@@ -13,6 +13,7 @@ from .controllers.base import Controller
 from .errors import JaxpendError
 from .plant import Plant
 from .rollout import rollout
+from .scenario import Scenario
 
 __all__ = [
     "V1_DEFAULT",
@@ -138,9 +139,15 @@ def criteria(
     )
 
 
-def performance(controller: Controller, plant: Plant, key: jax.Array) -> Criteria:
-    """Criteria of the official run: the nominal plant, 10 s at 500 Hz from hanging."""
-    run = rollout(plant, controller, key)
+def performance(
+    controller: Controller, scenario: Scenario | Plant, key: jax.Array, **options
+) -> Criteria:
+    """Criteria of an official run: 10 s at 500 Hz, on a plant or on a scenario around one.
+
+    ``options`` are those of ``rollout``.
+    """
+    run = rollout(scenario, controller, key, **options)
+    plant = scenario.plant if isinstance(scenario, Scenario) else scenario
     return criteria(run.t, run.x, run.u, plant)
 
 

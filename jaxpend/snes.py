@@ -20,6 +20,7 @@ from . import designs
 from ._struct import pytree
 from .controllers.policy import Policy
 from .errors import JaxpendError, choose
+from .randomisation import LONGEST_DELAY, sample
 from .score import performance, score_v2
 
 __all__ = ["SNESConfig", "SNESState", "evolve", "fitness", "init"]
@@ -38,6 +39,8 @@ class SNESConfig:
     searched: str = "all"  # "all" parameters, or "hidden": all but the output layer
     rollouts: int = 1  # noisy rollouts per individual
     action_noise: float = 0.1  # standard deviation before the tanh; 0 for none
+    scenarios: int = 0  # random imperfect scenarios a generation, the same for all individuals
+    scenario_weight: float = 0.5  # of their mean score in the fitness, where there are any
     chunk: int = 10  # generations per report
 
     def __post_init__(self):
@@ -47,6 +50,8 @@ class SNESConfig:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
         if not self.action_noise >= 0:
             raise JaxpendError(f"action_noise is {self.action_noise}; it must not be negative")
+        if self.scenarios < 0 or not 0 <= self.scenario_weight <= 1:
+            raise JaxpendError("scenarios must not be negative, scenario_weight lies in 0 to 1")
         if self.population < 2:
             raise JaxpendError("population is 1; SNES compares at least two individuals")
 
@@ -71,14 +76,28 @@ def split_parameters(config: SNESConfig, policy: Policy):
 
 
 def fitness(config: SNESConfig, policy: Policy, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean v2 score over noisy rollouts (to be maximised), and how many of them diverged."""
+    """Fitness of a policy, to be maximised, and how many of its rollouts diverged.
+
+    The mean v2 score over noisy nominal rollouts; with ``config.scenarios``, its weighted mean
+    with the mean v2 score over random imperfect scenarios (``randomisation.sample``).
+    """
+    plant = designs.competition(policy.robot)
+    key_noise, key_scenario, key_run = jax.random.split(key, 3)
     noise = jnp.asarray(config.action_noise, jnp.float32) if config.action_noise else None
     noisy = policy.replace(action_noise=noise)
-    count = config.rollouts if config.action_noise else 1
-    plant = designs.competition(policy.robot)
-    c = jax.vmap(lambda k: performance(noisy, plant, k))(jax.random.split(key, count))
+    keys = jax.random.split(key_noise, config.rollouts if config.action_noise else 1)
+    c = jax.vmap(lambda k: performance(noisy, plant, k))(keys)
     # A diverged rollout has score 0 already; its velocity says that it diverged.
-    return score_v2(c).mean(), jnp.sum(~jnp.isfinite(c.velocity_cost))
+    score, diverged = score_v2(c).mean(), jnp.sum(~jnp.isfinite(c.velocity_cost))
+    if not config.scenarios:
+        return score, diverged
+    wrong = jax.vmap(lambda k: sample(plant, k))(jax.random.split(key_scenario, config.scenarios))
+    keys = jax.random.split(key_run, config.scenarios)
+    slots = LONGEST_DELAY + 1
+    c = jax.vmap(lambda s, k: performance(policy, s, k, delay_slots=slots))(wrong, keys)
+    weight = config.scenario_weight
+    score = (1 - weight) * score + weight * score_v2(c).mean()
+    return score, diverged + jnp.sum(~jnp.isfinite(c.velocity_cost))
 
 
 def _strategy(config: SNESConfig, policy: Policy):

@@ -1,0 +1,107 @@
+"""Train several seeds of both robots, two single-threaded runs at a time, and tabulate them.
+
+    python experiments/seeds.py --recipes shipped plain --seeds 0 1 2
+
+writes experiments/seeds.json and experiments/seeds.md. A run that is already there is kept, so
+an interrupted sweep goes on where it was.
+"""
+
+import argparse
+import concurrent.futures
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).parent
+ROBOTS = ("acrobot", "pendubot")
+# One thread a run: two runs side by side use two cores better than one run does.
+THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+
+
+def train(recipe: str, robot: str, seed: int, runs: Path) -> dict:
+    """One run of `python -m jaxpend.train`; returns a row of the table."""
+    folder = runs / f"{recipe}-{robot}-{seed}"
+    if not (folder / "result.json").exists():
+        config = HERE / f"{robot if recipe == 'shipped' else recipe}.yaml"
+        command = [sys.executable, "-m", "jaxpend.train", "--config", str(config)]
+        command += [
+            "--robot",
+            robot,
+            "--seed",
+            str(seed),
+            "--runs",
+            str(runs),
+            "--run",
+            folder.name,
+        ]
+        environment = os.environ | {"XLA_FLAGS": THREAD}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        if done.returncode:
+            raise SystemExit(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
+    result = json.loads((folder / "result.json").read_text())
+    first = json.loads((folder / "metrics.jsonl").read_text().splitlines()[0])
+    keys = ("score", "success", "seconds")
+    return {
+        "recipe": recipe,
+        "robot": robot,
+        "seed": seed,
+        "imitation": first["score"] if recipe == "shipped" else None,
+        "sac": {k: result["sac"][k] for k in keys},
+        "snes": {k: result["snes"][k] for k in keys},
+        "criteria": result["snes"]["criteria"],
+    }
+
+
+def table(rows: list[dict]) -> str:
+    """A Markdown table, a row each, and the median and range of each group."""
+    lines = [
+        f"Machine: {platform.machine()}, {os.cpu_count()} cores; two single-threaded runs at once.",
+        "",
+        "| recipe | robot | seed | after imitation | after SAC | after SNES | SAC | SNES |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        start = "" if r["imitation"] is None else f"{r['imitation']:.4f}"
+        lines.append(
+            f"| {r['recipe']} | {r['robot']} | {r['seed']} | {start} | {r['sac']['score']:.4f} | "
+            f"{r['snes']['score']:.4f} | {r['sac']['seconds']:.0f} s | "
+            f"{r['snes']['seconds']:.0f} s |"
+        )
+    lines += [
+        "",
+        "| recipe | robot | seeds | median | lowest | highest |",
+        "|---|---|---|---|---|---|",
+    ]
+    for recipe, robot in sorted({(r["recipe"], r["robot"]) for r in rows}):
+        group = [r for r in rows if (r["recipe"], r["robot"]) == (recipe, robot)]
+        scores = [r["snes"]["score"] for r in group]
+        cells = (np.median(scores), min(scores), max(scores))
+        numbers = " | ".join(f"{cell:.4f}" for cell in cells)
+        lines.append(f"| {recipe} | {robot} | {len(scores)} | {numbers} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Run what is missing and write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--recipes", nargs="+", default=["shipped", "plain"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--robots", nargs="+", default=ROBOTS, choices=ROBOTS)
+    parser.add_argument("--runs", type=Path, default=Path("runs/seeds"))
+    parser.add_argument("--jobs", type=int, default=2)
+    args = parser.parse_args()
+    jobs = [(c, r, s, args.runs) for c in args.recipes for r in args.robots for s in args.seeds]
+    with concurrent.futures.ThreadPoolExecutor(args.jobs) as pool:
+        rows = list(pool.map(lambda job: train(*job), jobs))
+    (HERE / "seeds.json").write_text(json.dumps(rows, indent=1) + "\n")
+    (HERE / "seeds.md").write_text(table(rows))
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
