@@ -1,0 +1,179 @@
+"""The learning environment: reward and dynamics by other means, and life under Brax's wrappers."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs.base import Env
+from brax.envs.wrappers import training
+from conftest import assert_close, both_robots
+
+from jaxpend import JaxpendError, designs
+from jaxpend.env import DoublePendulum, EnvConfig, Reward, surrogate_reward
+from jaxpend.observation import Observation
+from jaxpend.plant import rk4_step
+
+LINE = {"acrobot": 0.375, "pendubot": 0.35}
+# The end effector of the second state lies between the lines of the two robots.
+STATES = {
+    "top": [math.pi - 0.2, 0.3, 1.5, -2.5],
+    "between": [math.pi - math.acos(0.36 / 0.5), 0.0, -1.0, 0.5],
+    "bent": [math.pi, 2.5, 3.0, 1.0],
+    "hanging": [0.3, -0.4, -6.0, 4.0],
+}
+step = jax.jit(lambda env, state, action: env.step(state, action), static_argnums=0)
+
+
+def paper_reward(robot, x, action, previous):
+    """The formula of the paper in plain numpy, the energies from the links' own velocities."""
+    p = designs.competition(robot)
+    (m1, m2), (l1, l2), (r1, r2), (i1, i2) = p.mass, p.length, p.com, p.inertia
+    q1, q2, w1, w2 = x
+    y = -l1 * np.cos(q1) - l2 * np.cos(q1 + q2)
+    v = 9.81 * (-m1 * r1 * np.cos(q1) - m2 * (l1 * np.cos(q1) + r2 * np.cos(q1 + q2)))
+    elbow = np.array([l1 * np.cos(q1), l1 * np.sin(q1)]) * w1
+    turning = np.array([r2 * np.cos(q1 + q2), r2 * np.sin(q1 + q2)]) * (w1 + w2)
+    about_com = i2 - m2 * r2**2
+    t = (i1 * w1**2 + m2 * np.sum((elbow + turning) ** 2) + about_com * (w1 + w2) ** 2) / 2
+    da = action - previous
+    if y > LINE[robot]:
+        return v + 2 * (1 + np.cos(q2)) ** 2 - t - 0.1 * action**2 - 0.15 * abs(da)
+    return v - 0.02 * action**2 - 0.15 * abs(da) - 0.02 * (w1**2 + w2**2)
+
+
+@both_robots
+@pytest.mark.parametrize("where", STATES)
+@pytest.mark.parametrize(("action", "previous"), [(0.0, 0.0), (0.7, -0.5), (-1.0, 0.2)])
+@pytest.mark.x64
+def test_reward_is_the_papers(robot, where, action, previous):
+    env = DoublePendulum(EnvConfig(robot))
+    x = np.array(STATES[where])
+    reward = surrogate_reward(env.plant, env.config.reward, x, action, previous)
+    assert_close(reward, paper_reward(robot, x, action, previous))
+
+
+def test_the_cases_lie_on_both_sides_of_the_line():
+    length = designs.competition("acrobot").length
+    y = {k: -length @ np.cos([x[0], x[0] + x[1]]) for k, x in STATES.items()}
+    assert y["top"] > 0.375 > y["between"] > 0.35 > y["bent"] > y["hanging"]
+    assert EnvConfig("acrobot").reward.line == 0.375
+    assert EnvConfig("pendubot").reward.line == 0.35
+
+
+@pytest.mark.x64
+def test_coefficients_and_floor_are_those_of_the_configuration():
+    plant = designs.competition("pendubot")
+    other = Reward(line=0.0, alpha=3.0, beta=0.5, rho1=1.0, rho2=2.0, phi1=3.0, phi2=4.0, eta=5.0)
+    zeroed = dict.fromkeys(("alpha", "beta", "rho1", "rho2", "phi1", "phi2", "eta"), 0.0)
+    for where in ("top", "hanging"):
+        x = jnp.array(STATES[where])
+
+        def earned(reward, x=x):
+            return float(surrogate_reward(plant, reward, x, 0.5, -0.1))
+
+        nothing = Reward(line=0.0, **zeroed)
+        terms = [
+            earned(dataclasses.replace(nothing, **{name: getattr(other, name)})) - earned(nothing)
+            for name in zeroed
+        ]
+        np.testing.assert_allclose(earned(other), earned(nothing) + sum(terms), rtol=1e-9)
+        # Each side of the line has its own terms, and only those.
+        above = where == "top"
+        assert [t != 0 for t in terms] == [above, above, above, not above, above, not above] + [
+            not above
+        ]
+        assert earned(dataclasses.replace(other, floor=1e3)) == 1e3
+        assert earned(dataclasses.replace(other, floor=-1e6)) == earned(other)
+
+
+@both_robots
+def test_a_step_is_one_of_the_plant_under_torque_on_the_driven_joint(robot):
+    env = DoublePendulum(EnvConfig(robot, torque_limit=2.5, dt=0.02))
+    x = jnp.array(STATES["bent"], jnp.float32)
+    start = env.reset(jax.random.key(0)).replace(
+        pipeline_state={"x": x, "action": jnp.asarray(-0.3)}
+    )
+    after = step(env, start, jnp.array([0.6]))
+    u = np.zeros(2, "f4")
+    u[designs.active_joint(robot)] = 0.6 * 2.5
+    expected = rk4_step(designs.competition(robot), x, u, 0.02)
+    assert_close(after.pipeline_state["x"], expected)
+    assert not np.allclose(expected, rk4_step(designs.competition(robot), x, 0 * u, 0.02))
+    # The reward is of the state arrived in and charges the change from the action before.
+    assert_close(after.reward, paper_reward(robot, np.float64(expected), 0.6, -0.3), times=5)
+    assert_close(after.obs, [*Observation()(expected), 0.6])
+    assert after.done == 0
+
+
+def test_actions_are_clipped_to_the_torque_limit():
+    env = DoublePendulum()
+    start = env.reset(jax.random.key(0))
+    for beyond, limit in ((3.0, 1.0), (-1.5, -1.0)):
+        clipped = step(env, start, jnp.array([beyond]))
+        jax.tree.map(np.testing.assert_array_equal, clipped, step(env, start, jnp.array([limit])))
+        assert clipped.pipeline_state["action"] == limit
+
+
+@pytest.mark.parametrize(("kind", "size"), [("wrapped", 5), ("sincos", 7)])
+def test_observations_have_the_previous_action_last(kind, size):
+    env = DoublePendulum(EnvConfig(observation=Observation(kind)))
+    state = step(env, env.reset(jax.random.key(0)), jnp.array([0.25]))
+    assert env.observation_size == size == state.obs.shape[0]
+    assert env.action_size == 1
+    assert state.obs[-1] == 0.25
+    near = [env.observe(jnp.array([math.pi, d, 0.0, 0.0]), 0.0) for d in (-1e-4, 1e-4)]
+    jump = np.abs(near[1] - near[0]).max()
+    # With wrapped angles the goal lies on the wrap; with sines and cosines nothing jumps there.
+    np.testing.assert_allclose(jump, 2.0 if kind == "wrapped" else 0.0, atol=1e-3)
+
+
+def batched_legacy(env):
+    return training.wrap(env, episode_length=3), jax.random.split(jax.random.PRNGKey(0), 2)
+
+
+def inner_typed(env):
+    env = training.AutoResetWrapper(training.EpisodeWrapper(env, 3, 1))
+    return training.VmapWrapper(env), jax.random.split(jax.random.key(0), 2)
+
+
+@pytest.mark.parametrize("wrapped", [batched_legacy, inner_typed])
+def test_brax_wrappers_count_truncate_and_reset(wrapped):
+    bare = DoublePendulum()
+    assert isinstance(bare, Env)
+    env, keys = wrapped(bare)
+    state, plain = env.reset(keys), bare.reset(keys[0])
+    assert state.obs.shape == (2, env.observation_size)
+    actions, wrapped_step = jnp.array([[0.5], [-1.0]]), jax.jit(env.step)
+    for k in range(1, 5):
+        state = wrapped_step(state, actions)
+        plain = step(bare, plain if k != 4 else bare.reset(keys[0]), actions[0])
+        assert_close(state.reward[0], plain.reward)
+        np.testing.assert_array_equal(state.done, [float(k == 3)] * 2)
+        np.testing.assert_array_equal(state.info["truncation"], [float(k == 3)] * 2)
+        expected = bare.reset(keys[0]).obs if k == 3 else plain.obs
+        assert_close(state.obs[0], expected)
+
+
+def test_episode_steps():
+    assert EnvConfig().episode_steps == 1000
+    assert EnvConfig(dt=0.02, duration=5.0).episode_steps == 250
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"robot": "cartpole"}, "unknown robot 'cartpole'; known: acrobot, pendubot"),
+        ({"torque_limit": 0.0}, "torque_limit is 0.0; it must be positive"),
+        ({"torque_limit": -3.0}, "torque_limit is -3.0; it must be positive"),
+        ({"dt": math.nan}, "dt is nan; it must be positive"),
+        ({"duration": -1.0}, "duration is -1.0; it must be positive"),
+        ({"max_speed": 0.0}, "max_speed is 0.0; it must be positive"),
+    ],
+)
+def test_senseless_values_are_one_sentence(values, words):
+    with pytest.raises(JaxpendError) as error:
+        EnvConfig(**values)
+    assert str(error.value) == words
