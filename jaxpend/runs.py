@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any, TypeVar
 
 import yaml
 
+from . import __version__
 from .controllers.policy import Policy, save_policy
 from .errors import JaxpendError
 from .files import write_atomically
@@ -78,8 +78,8 @@ class RunFolder:
     end, ``result.json``. Policies and results are written atomically.
     """
 
-    def __init__(self, path: str | Path, config: Any):
-        self.path = Path(path)
+    def __init__(self, path: str | Path, config: Any, command: str):
+        self.path, self.command = Path(path), command
         if (self.path / "config.json").exists():
             raise JaxpendError(
                 f"{self.path} already holds a run; choose another name or remove the folder"
@@ -101,6 +101,6 @@ class RunFolder:
 
     def save(self, name: str, policy: Policy, **provenance: Any) -> Path:
         """Write a policy file with the command and configuration that made it."""
-        made_by = {"command": " ".join(sys.argv), "config": self.config}
+        made_by = {"command": self.command, "version": __version__, "config": self.config}
         save_policy(self.path / name, policy, provenance | made_by)
         return self.path / name

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import sys
 import time
 from pathlib import Path
 
@@ -146,15 +147,15 @@ def train_snes(config: SNESConfig, start: Policy, seed: int, folder: RunFolder) 
     return best
 
 
-def train(config: Run) -> dict:
+def train(config: Run, command: str = "jaxpend.train.train") -> dict:
     """The stages that the configuration has; returns what ``result.json`` in its folder says.
 
-    The score of each stage is the official one, computed in float64.
+    ``command`` goes into the policy files, to say what made them. The score of each stage is the official one, computed in float64.
     """
     policy = None
     if isinstance(config, SNESRun):  # before the folder is made: a wrong file leaves nothing behind
         policy = load_policy(config.policy or config.robot, robot=config.robot)
-    folder = RunFolder(config.folder, config)
+    folder = RunFolder(config.folder, config, command)
     result = {"robot": config.robot, "seed": config.seed}
     if policy is not None:
         result["start"] = official(policy, config.robot)
@@ -180,7 +181,7 @@ def command(kind: type[Run], prog: str, description: str) -> None:
     """A training command: configuration, run, score table, and where the results are."""
     with cli.guard(prog):
         config = cli.configure(kind(), prog, description, also=("policy", "sac", "snes"))
-        result = train(config)
+        result = train(config, " ".join(["python -m", prog, *sys.argv[1:]]))
         stages = {"start": "start", "sac": "after SAC", "snes": "after SNES"}
         score_table({stages[k]: result[k] for k in stages if k in result}, config.robot)
         console.print(f"policy.npz, metrics and result are in [bold]{config.folder}[/bold]")
