@@ -150,7 +150,8 @@ def train_snes(config: SNESConfig, start: Policy, seed: int, folder: RunFolder) 
 def train(config: Run, command: str = "jaxpend.train.train") -> dict:
     """The stages that the configuration has; returns what ``result.json`` in its folder says.
 
-    ``command`` goes into the policy files, to say what made them. The score of each stage is the official one, computed in float64.
+    ``command`` goes into the policy files, to say what made them. The score of each stage is the
+    official one, computed in float64.
     """
     policy = None
     if isinstance(config, SNESRun):  # before the folder is made: a wrong file leaves nothing behind
