@@ -2,15 +2,13 @@
 
 import argparse
 import contextlib
-import json
-import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from .errors import JaxpendError
-from .files import write_atomically
+from .files import to_json, write_atomically
 
 __all__ = ["configure", "emit_json", "guard", "run"]
 
@@ -68,22 +66,11 @@ def configure(default: T, prog: str, description: str, also: Sequence[str] = ())
     return tyro.cli(type(default), default=default, args=rest, prog=prog, description=description)
 
 
-def _plain(value: Any) -> Any:
-    """Arrays to numbers and lists; what JSON has no number for (inf, nan) to null."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def emit_json(value: Any, target: str | Path | None) -> None:
     """Write ``value`` as JSON to standard output ("-") or, atomically, to a file; None: nowhere."""
     if target is None:
         return
-    text = json.dumps(_plain(value), indent=2) + "\n"
+    text = to_json(value, indent=2) + "\n"
     if str(target) == "-":
         sys.stdout.write(text)
     else:

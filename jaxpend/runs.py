@@ -1,5 +1,6 @@
 """Configurations in files and run folders on disk."""
 
+import contextlib
 import dataclasses
 import json
 import time
@@ -12,7 +13,7 @@ import yaml
 from . import __version__
 from .controllers.policy import Policy, save_policy
 from .errors import JaxpendError
-from .files import write_atomically
+from .files import to_json, write_atomically
 
 __all__ = ["RunFolder", "from_mapping", "load_config", "to_mapping"]
 
@@ -20,8 +21,11 @@ T = TypeVar("T")
 
 
 def to_mapping(config: Any) -> dict:
-    """A configuration dataclass as plain nested dicts and lists, as YAML and JSON have them."""
-    return json.loads(json.dumps(dataclasses.asdict(config)))
+    """A configuration dataclass as plain nested dicts and lists, as YAML and JSON have them.
+
+    Infinities become text, since JSON has no number for them; ``from_mapping`` reads it back.
+    """
+    return json.loads(json.dumps(dataclasses.asdict(config)), parse_constant=str)
 
 
 def from_mapping(default: T, values: Any, where: str) -> T:
@@ -46,8 +50,10 @@ def _converted(old: Any, value: Any, where: str) -> Any:
         return from_mapping(old, value, where)
     if isinstance(old, tuple) and isinstance(value, list):
         return tuple(value)
-    if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+    if isinstance(old, float) and isinstance(value, int | str) and not isinstance(value, bool):
+        # YAML takes 1e-3 for text, and the infinities of ``to_mapping`` are text.
+        with contextlib.suppress(ValueError):
+            return float(value)
     if old is not None and type(value) is not type(old):
         raise JaxpendError(f"{where}: {value!r} is not {type(old).__name__}")
     return value
@@ -90,14 +96,14 @@ class RunFolder:
 
     def write_json(self, name: str, value: Any) -> None:
         """Write a JSON file."""
-        write_atomically(self.path / name, json.dumps(value, indent=2) + "\n")
+        write_atomically(self.path / name, to_json(value, indent=2) + "\n")
 
     def log(self, stage: str, **values: Any) -> None:
         """Append one row of metrics."""
         row = {"stage": stage, "seconds": round(time.perf_counter() - self.started, 2)}
         row |= {k: v if isinstance(v, int | str) else float(v) for k, v in values.items()}
         with (self.path / "metrics.jsonl").open("a") as file:
-            file.write(json.dumps(row) + "\n")
+            file.write(to_json(row) + "\n")
 
     def save(self, name: str, policy: Policy, **provenance: Any) -> Path:
         """Write a policy file with the command and configuration that made it."""

@@ -15,7 +15,7 @@ import optax
 from ._struct import pytree
 from .controllers.policy import ACTIVATIONS, Policy
 from .demonstrations import DemonstrationConfig, imitate, swingups
-from .env import EnvConfig
+from .env import LINES, EnvConfig
 from .errors import JaxpendError, choose
 from .networks import Actor, TwinCritic, constant_log_std, sample_action, to_policy
 
@@ -65,10 +65,12 @@ class SACConfig:
         choose("activation", self.activation, ACTIVATIONS)
 
     def for_robot(self, robot: str) -> "SACConfig":
-        """The same for another robot, whose line of the reward is its own."""
+        """The same for another robot; the reward's line becomes that robot's, if not chosen."""
         if robot == self.env.robot:
             return self
-        reward = dataclasses.replace(self.env.reward, line=None)
+        reward = self.env.reward
+        if reward.line == LINES[self.env.robot]:
+            reward = dataclasses.replace(reward, line=None)
         env = dataclasses.replace(self.env, robot=robot, reward=reward)
         return dataclasses.replace(self, env=env)
 

@@ -1,0 +1,159 @@
+"""Configurations from files, and what a run folder keeps."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import jax.numpy as jnp
+import pytest
+
+from jaxpend import JaxpendError, Policy, load_policy
+from jaxpend.controllers.policy import read_header
+from jaxpend.runs import RunFolder, from_mapping, load_config, to_mapping
+from jaxpend.train import SNESRun, TrainRun
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+
+
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    """A section."""
+
+    speed: float = math.inf
+    sizes: tuple[int, ...] = (1, 2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Outer:
+    """A configuration."""
+
+    count: int = 3
+    name: str = "a"
+    fast: bool = False
+    inner: Inner = dataclasses.field(default_factory=Inner)
+
+
+def test_named_fields_are_replaced_and_the_others_kept():
+    changed = from_mapping(Outer(), {"count": 4, "inner": {"sizes": [5], "speed": 2}}, "x")
+    assert changed == Outer(count=4, inner=Inner(2.0, (5,)))
+    assert isinstance(changed.inner.speed, float)
+    assert from_mapping(Outer(), {}, "x") == Outer()
+
+
+def test_numbers_that_yaml_takes_for_text(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("inner: {speed: 1e-3}")
+    assert load_config(Outer(), path).inner.speed == 1e-3
+
+
+@pytest.mark.parametrize("config", [Outer(name="b"), TrainRun("acrobot"), SNESRun(seed=4)])
+def test_a_stored_configuration_is_strict_json_and_reads_back(config, tmp_path):
+    path = RunFolder(tmp_path / "run", config, "command").path / "config.json"
+    json.loads(path.read_text(), parse_constant=pytest.fail)
+    assert load_config(type(config)(), path) == config
+    assert from_mapping(type(config)(), to_mapping(config), "x") == config
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("cout: 4", "unknown field 'cout'; known: count, name, fast, inner"),
+        ("inner: {sped: 4}", "inner: unknown field 'sped'; known: speed, sizes"),
+        ("count: many", "count: 'many' is not int"),
+        ("count: 1.5", "count: 1.5 is not int"),
+        ("count: true", "count: True is not int"),
+        ("name: 3", "name: 3 is not str"),
+        ("fast: 1", "fast: 1 is not bool"),
+        ("inner: {speed: fast}", "inner: speed: 'fast' is not float"),
+        ("inner: {speed: true}", "inner: speed: True is not float"),
+        ("inner: {sizes: 4}", "inner: sizes: 4 is not tuple"),
+        ("inner: 4", "inner: expected fields of Inner"),
+        ("- count", "expected fields of Outer"),
+        ("count: [", "is not valid YAML"),
+    ],
+)
+def test_bad_files_are_one_sentence(tmp_path, text, words):
+    path = tmp_path / "c.yaml"
+    path.write_text(text)
+    with pytest.raises(JaxpendError) as error:
+        load_config(Outer(), path)
+    assert words in str(error.value)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+def test_missing_and_binary_files_are_one_sentence(tmp_path):
+    with pytest.raises(JaxpendError, match=r"there is no configuration file .*nothing\.yaml"):
+        load_config(Outer(), tmp_path / "nothing.yaml")
+    (tmp_path / "binary").write_bytes(b"\xff\xfe\x00\x9f")
+    with pytest.raises(JaxpendError, match="is not valid YAML"):
+        load_config(Outer(), tmp_path / "binary")
+
+
+def test_sections_of_other_commands_are_passed_over_only_where_said(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("count: 5\nsac: {steps: 1}")
+    assert load_config(Outer(), path, also=("sac",)) == Outer(count=5)
+    with pytest.raises(JaxpendError, match="unknown field 'sac'"):
+        load_config(Outer(), path, also=("snes",))
+    path.write_text("inner: {speed: 2}")  # a section that there is a field for is read
+    assert load_config(Outer(), path, also=("inner",)).inner.speed == 2
+    path.write_text("")
+    assert load_config(Outer(), path) == Outer()
+
+
+@pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
+def test_the_recipes_are_valid_for_every_training_command(robot):
+    path = EXPERIMENTS / f"{robot}.yaml"
+    run = load_config(TrainRun(), path, ("policy", "sac", "snes"))
+    assert run.robot == run.sac.env.robot == robot
+    assert run.sac.env.reward.line == {"acrobot": 0.375, "pendubot": 0.35}[robot]
+    assert load_config(SNESRun(), path, ("policy", "sac", "snes")).snes == run.snes
+
+
+def small_policy():
+    """The smallest network that a file takes."""
+    return Policy(((jnp.ones((6, 1)), jnp.zeros(1)),), torque_limit=jnp.asarray(3.0))
+
+
+def test_a_run_folder_does_not_take_a_second_run(tmp_path):
+    folder = RunFolder(tmp_path / "deep" / "run", Outer(), "command")
+    folder.log("sac", score=0.5)
+    with pytest.raises(JaxpendError, match="already holds a run") as error:
+        RunFolder(folder.path, Outer(count=9), "command")
+    assert "\n" not in str(error.value)
+    assert json.loads((folder.path / "config.json").read_text())["count"] == 3
+
+
+def test_metrics_are_one_strict_json_row_an_evaluation(tmp_path):
+    folder = RunFolder(tmp_path, Outer(), "command")
+    folder.log("sac", env_steps=10, score=jnp.asarray(0.25), loss=jnp.asarray(jnp.nan))
+    folder.log("snes", generation=1, best=math.inf)
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    first, second = (json.loads(line, parse_constant=pytest.fail) for line in lines)
+    assert first | {"seconds": 0} == {
+        "stage": "sac", "seconds": 0, "env_steps": 10, "score": 0.25, "loss": None,
+    }  # fmt: skip
+    assert (second["stage"], second["generation"], second["best"]) == ("snes", 1, None)
+    assert 0 <= first["seconds"] <= second["seconds"] < 60
+
+
+def test_policies_say_what_made_them_and_replace_the_old_file_whole(tmp_path, monkeypatch):
+    folder = RunFolder(tmp_path, Outer(), "train --seed 7")
+    path = folder.save("policy.npz", small_policy(), stage="sac", score=0.5)
+    provenance = read_header(path)["provenance"]
+    assert provenance["stage"] == "sac"
+    assert provenance["config"] == to_mapping(Outer())
+    assert provenance["command"] == "train --seed 7"
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        folder.save("policy.npz", small_policy().replace(robot="acrobot"))
+    assert path.read_bytes() == before
+    assert {p.name for p in tmp_path.iterdir()} == {"config.json", "policy.npz"}
+    assert load_policy(path).robot == "pendubot"
