@@ -20,7 +20,6 @@ import numpy as np
 from ._struct import pytree, static
 from .ilqr import Problem
 from .plant import Plant, forward_kinematics, rk4_step
-from .score import V2_OFFICIAL
 
 __all__ = ["SwingUp", "problem", "step"]
 
@@ -59,6 +58,8 @@ def _features(p: SwingUp, k: jax.Array, z: jax.Array, u: jax.Array) -> jax.Array
 
 
 def _outer(p: SwingUp, totals: jax.Array) -> jax.Array:
+    from .score import V2_OFFICIAL  # score needs rollout, which needs the controllers
+
     smoothness = jnp.sqrt(totals[3] / OFFICIAL_STEPS + 1e-12)
     norms = jnp.array([V2_OFFICIAL[name] for name in CRITERIA], totals.dtype)
     return jnp.mean(jnp.tanh(jnp.pi * totals.at[3].set(smoothness) / norms))
