@@ -25,13 +25,16 @@ def kept(robot: str, names: list[str], path: Path) -> list[dict]:
     return [r for r in rows if r["source"] == "measured" and r["name"] not in names]
 
 
-def main(controllers: str = ",".join(CLASSICAL), keys: int = 3, seed: int = 0) -> None:
+def main(
+    controllers: str = ",".join(CLASSICAL), keys: int = 3, seed: int = 0, robustness: bool = True
+) -> None:
     """Judge controllers on both boards.
 
     Args:
         controllers: names separated by commas.
         keys: repetitions of what the benchmark draws; the table shows the first key.
         seed: of the first key.
+        robustness: False measures performance only.
     """
     names = [choose("controller", name, KNOWN) for name in controllers.split(",")]
     path = HERE / "leaderboard.json"
@@ -42,7 +45,7 @@ def main(controllers: str = ",".join(CLASSICAL), keys: int = 3, seed: int = 0) -
             for name in names
         }
         board = leaderboard.leaderboard(
-            robot, chosen, say=report.console.print, keys=keys, seed=seed
+            robot, chosen, say=report.console.print, keys=keys, seed=seed, robustness=robustness
         )
         rows = board["rows"] + kept(robot, names, path)
         board["rows"] = sorted(rows, key=lambda row: -row["score"])
