@@ -20,6 +20,7 @@ from .controllers.base import Controller
 from .env import DoublePendulum
 from .errors import JaxpendError
 from .networks import Actor
+from .scenario import random_pulses
 
 __all__ = ["DemonstrationConfig", "collect", "imitate", "swingups"]
 
@@ -30,13 +31,14 @@ SATURATED = 0.99  # of the torque limit
 class DemonstrationConfig:
     """How demonstrations are made and imitated.
 
-    Each episode scales all its noise by its own s^2, s uniform in [0, 1].
+    Each episode scales its noise by its own s^2, s uniform in [0, 1]; pulses are not scaled.
     """
 
     episodes: int = 0  # 0: no demonstrations, learn from the reward alone
     duration: float = 4.0  # s an episode
     action_noise: float = 0.3  # largest standard deviation, of the normalised action
     kicks: float = 0.1  # rad/s, largest standard deviation of velocity jumps between steps
+    pulses: float = 0.0  # strength of disturbance pulses; 1 is the robustness benchmark's
     start_spread: float = 0.1  # rad and rad/s, largest standard deviation of the initial state
     updates: int = 20_000  # imitation updates of the actor before SAC
     batch_size: int = 1024
@@ -72,10 +74,15 @@ def collect(
     steps = round(config.duration / env.config.dt)
 
     def episode(key):
-        key_level, key_start, key_controller, key_action, key_kick = jax.random.split(key, 5)
+        key_level, key_start, key_controller, key_action, key_kick, key_pulse = jax.random.split(
+            key, 6
+        )
         level = jax.random.uniform(key_level) ** 2
         x = level * config.start_spread * jax.random.normal(key_start, (4,))
         noise = level * config.action_noise * jax.random.normal(key_action, (steps,))
+        pulses = random_pulses(key_pulse)
+        bursts = jax.vmap(pulses.torque)(env.config.dt * jnp.arange(steps))[:, joint]
+        noise = noise + config.pulses * bursts / limit
         kicks = level * config.kicks * jax.random.normal(key_kick, (steps, 2))
 
         def step(carry, now):
