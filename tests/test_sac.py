@@ -1,0 +1,336 @@
+"""SAC on probe environments whose answer is known, and its parts one at a time."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from brax.envs.base import State
+from conftest import assert_close
+
+from jaxpend import JaxpendError, sac
+from jaxpend.env import EnvConfig, Reward
+from jaxpend.networks import constant_log_std
+from jaxpend.sac import ROW, SACConfig
+
+KEY = jax.random.key(0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Probe:
+    """An environment with random starts behind the seam that SAC asks: ``make``."""
+
+    advance: Callable  # (state (4,), previous action, action) -> next state, reward
+    episode_steps: int = 8
+    max_speed: float = math.inf
+
+    observation_size = 5
+
+    def make(self):
+        return self
+
+    def observe(self, x, action):
+        return jnp.append(x, action)
+
+    def reset(self, rng):
+        x, zero = jax.random.uniform(rng, (4,), minval=-1.0), jnp.zeros(())
+        return State({"x": x, "action": zero}, self.observe(x, zero), zero, zero, {}, {})
+
+    def step(self, state, action):
+        before = state.pipeline_state
+        x, reward = self.advance(before["x"], before["action"], action[0])
+        after = {"x": x, "action": action[0]}
+        return state.replace(pipeline_state=after, obs=self.observe(x, action[0]), reward=reward)
+
+
+def stay(x, previous, action):
+    """The state stays, and its first entry is worth itself and 1 more."""
+    return x, 1 + x[0]
+
+
+def credit(x, previous, action):
+    """Where x0 > 0 the last action pays off, and the action 0.5 is best; elsewhere nothing."""
+    late = x[0] > 0
+    x_next = jnp.where(late, jnp.array([-0.5, 0, 0, 0]), jnp.array([0.5, 0, 0, 0]))
+    x_next = x_next.at[1].set(jnp.where(late, 0.0, action))
+    return x_next, jnp.where(late, x[1] - 4 * (action - 0.5) ** 2, 0.0)
+
+
+def drift(x, previous, action):
+    """Every entry of the transition leaves a trace; the second velocity falls by 1 a step."""
+    return x + jnp.stack([action, previous, 0.0 * action, -1.0]), 10 * x[0] + action
+
+
+small = partial(
+    SACConfig, num_envs=16, batch_size=64, warmup_steps=0, replay_capacity=4096, reward_scale=1.0,
+    actor_hidden=(16,), critic_hidden=(32,), learning_rate=3e-3, target_rate=0.05,
+)  # fmt: skip
+VALUE = small(env=Probe(stay), discount=0.8, init_temperature=0.5, actor_delay=10**9)
+CREDIT = small(env=Probe(credit), discount=0.9, init_temperature=0.02, target_entropy=-2.0)
+REPLAY = small(
+    env=Probe(drift, episode_steps=5, max_speed=3.5), num_envs=4, replay_capacity=15,
+    warmup_steps=8, reward_scale=0.5,
+)  # fmt: skip
+update = jax.jit(sac.update, static_argnums=0)
+interact = jax.jit(sac.interact, static_argnums=0)
+
+
+def greedy(config, state, obs):
+    """Greedy actions for observations (n, 5)."""
+    return np.tanh(sac.networks(config)[0].apply(state.actor, jnp.asarray(obs))[0])[:, 0]
+
+
+def leaves_equal(a, b):
+    """Whether two pytrees are the same, bit by bit."""
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return all(np.array_equal(x, y) for x, y in pairs)
+
+
+def without_keys(state):
+    """The state with its key as plain numbers."""
+    return state.replace(key=jax.random.key_data(state.key))
+
+
+@pytest.fixture(scope="module")
+def solved():
+    """A state trained on ``CREDIT``, and the metrics of its one chunk."""
+    return sac.train_chunk(CREDIT, sac.init(CREDIT, KEY), 300)
+
+
+def test_values_bootstrap_through_the_time_limit_with_the_entropy_on_top():
+    state = sac.init(VALUE, KEY)
+    actor = jax.tree.map(jnp.zeros_like, state.actor)  # tanh(N(0, 1)) everywhere
+    state = state.replace(actor=actor)
+    start = jax.tree.map(jnp.copy, (state.actor, state.log_temperature, state.critic))
+    state, metrics = sac.train_chunk(VALUE, state, 400)
+    v = np.linspace(-8, 8, 4001)
+    density = np.exp(-(v**2) / 2) / np.sqrt(2 * np.pi)
+    entropy = np.trapezoid(-density * (np.log(density) - np.log(1 - np.tanh(v) ** 2)), v)
+    np.testing.assert_allclose(metrics["entropy"], entropy, atol=0.02)
+    x = np.zeros((9, 4), "f4")
+    x[:, 0] = np.linspace(-0.6, 0.6, 9)
+    obs = np.concatenate([x, np.zeros((9, 1), "f4")], axis=1)
+    q = sac.networks(VALUE)[1].apply(state.critic, obs, np.zeros((9, 1), "f4"))
+    expected = (1 + x[:, :1] + 0.8 * 0.5 * entropy) / (1 - 0.8)
+    np.testing.assert_allclose(q, np.repeat(expected, 2, axis=1), atol=0.6)
+    np.testing.assert_allclose(q.mean(), expected.mean(), atol=0.25)
+    # The actor and the temperature wait for actor_delay; the critics did not.
+    assert leaves_equal((state.actor, state.log_temperature), start[:2])
+    assert not leaves_equal(state.critic, start[2])
+
+
+def test_actions_are_paid_for_now_and_one_step_later(solved):
+    state, _ = solved
+    early = greedy(CREDIT, state, [[-0.5, 0, 0, 0, 0.5]])
+    assert early[0] > 0.6
+    late = greedy(CREDIT, state, [[0.5, a, 0, 0, a] for a in (0.7, 0.9)])
+    np.testing.assert_allclose(late, 0.5, atol=0.12)
+
+
+def test_same_key_same_bits_and_another_key_other_bits(solved):
+    state, metrics = solved
+    again, more = sac.train_chunk(CREDIT, sac.init(CREDIT, KEY), 300)
+    assert leaves_equal((without_keys(again), more), (without_keys(state), metrics))
+    other = sac.init(CREDIT, jax.random.key(1))
+    assert not leaves_equal(other.actor, sac.init(CREDIT, KEY).actor)
+    counts = [int(state.env_steps), int(state.updates), int(state.replay.size)]
+    assert counts == [300 * 16, 300 * CREDIT.updates_per_step, 4096]
+    assert int(state.replay.position) == 300 * 16 - 4096
+
+
+def batch_of(config, seed=0):
+    """Replay rows of an update (batch_size, ROW) from a fixed seed."""
+    shape = (config.batch_size, ROW)
+    return jnp.asarray(np.random.default_rng(seed).uniform(-1, 1, shape), jnp.float32)
+
+
+def with_actor(state, log_std, log_temperature=0.0):
+    """The state with a constant standard deviation and a temperature of choice."""
+    actor = constant_log_std(state.actor, log_std)
+    return state.replace(actor=actor, log_temperature=jnp.array(log_temperature, jnp.float32))
+
+
+def test_critics_learn_towards_the_lower_target_value_of_the_next_observation():
+    state, batch = sac.init(CREDIT, KEY), batch_of(CREDIT)
+    shifted = jax.tree.map(lambda w: w + 0.3, state.target)
+    state = with_actor(state, -10.0, -20.0).replace(target=shifted)  # no noise, no entropy
+    after, metrics = update(CREDIT, state, batch, KEY)
+    x, previous, action, reward, next_x = np.split(batch, (4, 5, 6, 7), axis=1)
+    obs = np.concatenate([x, previous], axis=1)
+    next_obs = np.concatenate([next_x, action], axis=1)
+    critic = sac.networks(CREDIT)[1]
+    next_action = greedy(CREDIT, state, next_obs)[:, None]
+    q_next = np.asarray(critic.apply(state.target, next_obs, next_action))
+    assert 0.0 < np.mean(q_next[:, 0] < q_next[:, 1]) < 1.0
+    target = reward + 0.9 * q_next.min(axis=1, keepdims=True)
+    q = np.asarray(critic.apply(state.critic, obs, action))
+    np.testing.assert_allclose(metrics["critic_loss"], np.mean((q - target) ** 2), rtol=1e-3)
+    np.testing.assert_allclose(metrics["value"], q.mean(), rtol=1e-3)
+    # The targets follow at their rate.
+    jax.tree.map(
+        lambda new, old, learned: assert_close(new, old + 0.05 * (learned - old)),
+        after.target, state.target, after.critic,
+    )  # fmt: skip
+
+
+def test_temperature_holds_the_entropy_at_its_target():
+    fresh, batch = sac.init(CREDIT, KEY), batch_of(CREDIT)
+    for log_std, rises in ((-5.0, True), (0.0, False)):
+        after, metrics = update(CREDIT, with_actor(fresh, log_std), batch, KEY)
+        assert (metrics["entropy"] < CREDIT.target_entropy) == rises
+        assert_close(after.log_temperature, 3e-3 if rises else -3e-3)
+
+
+def test_actor_spreads_out_when_the_temperature_is_high():
+    state, entropies = with_actor(sac.init(CREDIT, KEY), -3.0, 5.0), []
+    for key in jax.random.split(KEY, 30):
+        state, metrics = update(CREDIT, state, batch_of(CREDIT), key)
+        entropies.append(float(metrics["entropy"]))
+    assert entropies[-1] > entropies[0] + 0.1
+
+
+def test_imitation_pulls_the_demonstrated_half_towards_the_wanted_actions():
+    config = dataclasses.replace(CREDIT, imitation=100.0, env=Probe(stay))
+    state, half = sac.init(config, KEY), config.batch_size // 2
+    batch = jnp.pad(batch_of(config), ((0, 0), (0, 1)))
+    # Demonstrations live where x0 > 0; the other half wants nothing, whatever its column says.
+    sign = jnp.where(jnp.arange(config.batch_size) < half, 1.0, -1.0)
+    batch = batch.at[:, 0].set(sign * (0.5 + 0.5 * jnp.abs(batch[:, 0])))
+    batch = batch.at[:, -1].set(jnp.where(sign > 0, 0.6, -1.0))
+    for key in jax.random.split(KEY, 150):
+        state, _ = update(config, state, batch, key)
+    actions = greedy(config, state, batch[:, :5])
+    np.testing.assert_allclose(actions[:half].mean(), 0.6, atol=0.1)
+    assert actions[half:].mean() > -0.5
+
+
+def run_interaction(steps):
+    """States before and after each of some vector steps on ``REPLAY``, greedy but for warmup."""
+    state = with_actor(sac.init(REPLAY, KEY), -10.0)
+    for key in jax.random.split(KEY, steps):
+        after, reward = interact(REPLAY, state, key)
+        yield state, after, reward
+        state = after
+
+
+def test_replay_holds_the_last_transitions_as_they_were():
+    history, capacity = list(run_interaction(8)), 12  # the multiple of num_envs below 15
+    assert history[0][0].replay.rows.shape == (capacity, ROW)
+    for k, (before, after, mean_reward) in enumerate(history):
+        replay = after.replay
+        assert (replay.position, replay.size) == (4 * (k + 1) % 12, min(4 * (k + 1), 12))
+        rows = np.asarray(replay.rows[4 * k % 12 : 4 * k % 12 + 4])
+        x, previous = (np.asarray(before.env_x.pipeline_state[name]) for name in ("x", "action"))
+        action = rows[:, 5]
+        np.testing.assert_array_equal(rows[:, :4], x)
+        np.testing.assert_array_equal(rows[:, 4], previous)
+        assert_close(rows[:, 6], 0.5 * (10 * x[:, 0] + action))
+        assert_close(mean_reward, np.mean(10 * x[:, 0] + action), times=5)
+        # The true next state, also where the episode was cut and a new one began.
+        step = np.stack([action, previous, np.zeros(4), -np.ones(4)], axis=1)
+        assert_close(rows[:, 7:], x + step)
+        wanted = greedy(REPLAY, before, before.env_x.obs)
+        uniform = 4 * k < REPLAY.warmup_steps
+        assert np.allclose(action, wanted, atol=1e-3) != uniform
+        # What is not being written is kept.
+        kept = np.ones(12, bool)
+        kept[4 * k % 12 : 4 * k % 12 + 4] = False
+        np.testing.assert_array_equal(replay.rows[kept], before.replay.rows[kept])
+
+
+def test_episodes_end_by_time_and_by_speed_and_start_anew():
+    cut_by, starts = set(), []
+    for before, after, _ in run_interaction(12):
+        row = int(before.env_steps) % 12
+        arrived = np.asarray(after.replay.rows[row : row + 4, 7:])
+        late = np.asarray(before.env_time) + 1 >= 5
+        fast = np.abs(arrived[:, 2:]).max(axis=1) > 3.5
+        ended = late | fast
+        cut_by |= {(bool(a), bool(b)) for a, b in zip(late, fast, strict=True)}
+        expected = np.where(ended, 0, np.asarray(before.env_time) + 1)
+        np.testing.assert_array_equal(after.env_time, expected)
+        x, action = (np.asarray(after.env_x.pipeline_state[name]) for name in ("x", "action"))
+        np.testing.assert_array_equal(x[~ended], arrived[~ended])
+        assert np.all(np.abs(x[ended]) <= 1)
+        assert not action[ended].any()
+        obs = np.concatenate([x, action[:, None]], axis=1)
+        np.testing.assert_array_equal(after.env_x.obs, obs)
+        starts.extend(x[ended, 0])
+    assert {(True, False), (False, True), (False, False)} <= cut_by
+    assert len(set(starts)) == len(starts) > 8  # a fresh key at every reset
+
+
+def test_environments_start_at_different_times_of_the_episode():
+    times = np.asarray(sac.init(CREDIT, KEY).env_time)
+    assert len(set(times)) > 3
+    assert times.min() >= 0
+    assert times.max() < 8
+
+
+def test_batches_come_from_filled_rows_and_half_of_them_from_demonstrations():
+    config, state = CREDIT, sac.init(CREDIT, KEY)
+    marked = jnp.arange(4096.0)[:, None] * jnp.ones(ROW)
+    replay = sac.Replay(marked, jnp.asarray(20), jnp.asarray(20))
+    own = np.asarray(sac.sample(config, state.replace(replay=replay), KEY))
+    assert own.shape == (config.updates_per_step, 64, ROW)
+    assert set(own[..., 0].ravel()) == set(range(20))
+    demonstrations = -1 - jnp.arange(7.0)[:, None] * jnp.ones(ROW + 1)
+    state = state.replace(replay=replay, demonstrations=demonstrations)
+    both = np.asarray(sac.sample(config, state, KEY))
+    assert both.shape == (config.updates_per_step, 64, ROW + 1)
+    assert set(both[:, :32].ravel()) == set(range(-7, 0))
+    assert set(both[:, 32:, :ROW].ravel()) == set(range(20))
+    assert not both[:, 32:, ROW].any()
+
+
+def test_nothing_is_learned_during_warmup():
+    config = dataclasses.replace(CREDIT, warmup_steps=3 * 16, updates_per_step=1)
+    start = sac.init(config, KEY)
+    learned = [jax.tree.map(jnp.copy, start.actor)]
+    state, updates = start, []
+    for _ in range(5):
+        state, _ = sac.train_chunk(config, state, 1)
+        updates.append(int(state.updates))
+        learned.append(jax.tree.map(jnp.copy, state.actor))
+    assert updates == [0, 0, 0, 1, 2]
+    assert [leaves_equal(learned[0], later) for later in learned[1:]] == [True] * 3 + [False] * 2
+
+
+def test_learning_rate_decays_over_the_whole_run():
+    config = small(steps=16 * 5, updates_per_step=2, final_learning_rate=0.1)
+    transformation, rates = sac.optimizer(config), []
+    state = transformation.init(jnp.zeros(()))
+    for _ in range(11):  # under a constant gradient, Adam steps by the learning rate
+        change, state = transformation.update(jnp.ones(()), state)
+        rates.append(float(optax.apply_updates(jnp.zeros(()), change)))
+    np.testing.assert_allclose([rates[0], rates[10]], [-3e-3, -3e-4], rtol=1e-3)
+    assert rates == sorted(rates)
+
+
+def test_another_robot_has_its_own_line_unless_one_was_chosen():
+    assert SACConfig().for_robot("acrobot").env == EnvConfig("acrobot")
+    chosen = SACConfig(env=EnvConfig("pendubot", reward=Reward(line=0.4)))
+    assert chosen.for_robot("acrobot").env.reward.line == 0.4
+    assert chosen.for_robot("pendubot") == chosen
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"steps": 0}, "steps is 0; it must be positive"),
+        ({"learning_rate": -1.0}, "learning_rate is -1.0; it must be positive"),
+        ({"discount": 1.0}, "discount is 1.0; it must be below 1"),
+        ({"num_envs": 8, "replay_capacity": 7}, "must hold at least one step of all"),
+        ({"activation": "exp"}, "unknown activation 'exp'; known: relu, tanh, silu"),
+    ],
+)
+def test_senseless_values_are_one_sentence(values, words):
+    with pytest.raises(JaxpendError) as error:
+        SACConfig(**values)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
