@@ -70,9 +70,8 @@ def main() -> None:
     updates = vector_steps * config.updates_per_step / seconds
     steps = vector_steps * config.num_envs / seconds
     name = f"SAC: {vector_steps} vector steps, 2x128"
-    print(
-        f"{name:44s}{compile_time:12.2f}{seconds:10.3f}  ({updates:,.0f} updates/s, {steps:,.0f} steps/s)"
-    )
+    speed = f"({updates:,.0f} updates/s, {steps:,.0f} steps/s)"
+    print(f"{name:44s}{compile_time:12.2f}{seconds:10.3f}  {speed}")
 
     for scenarios in (0, 16):
         config = snes.SNESConfig(action_noise=0.0, scenarios=scenarios)

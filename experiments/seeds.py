@@ -23,6 +23,15 @@ ROBOTS = ("acrobot", "pendubot")
 THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 
+def robustness(robot: str, policy: Path) -> dict:
+    """Overall robustness of a policy over five benchmark keys: median, lowest, highest."""
+    command = [sys.executable, "-m", "jaxpend.robustness", "--robot", robot, "--out", "None"]
+    command += ["--policy", str(policy), "--keys", "5", "--json", "-"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    overall = json.loads(done.stdout)["over_keys"]["overall"]
+    return {"median": float(np.median(overall)), "lowest": min(overall), "highest": max(overall)}
+
+
 def train(recipe: str, robot: str, seed: int, runs: Path) -> dict:
     """One run of `python -m jaxpend.train`; returns a row of the table."""
     folder = runs / f"{recipe}-{robot}-{seed}"
@@ -54,27 +63,31 @@ def train(recipe: str, robot: str, seed: int, runs: Path) -> dict:
         "sac": {k: result["sac"][k] for k in keys},
         "snes": {k: result["snes"][k] for k in keys},
         "criteria": result["snes"]["criteria"],
+        "robustness": robustness(robot, folder / "policy.npz"),
     }
 
 
 def table(rows: list[dict]) -> str:
     """A Markdown table, a row each, and the median and range of each group."""
     lines = [
-        f"Machine: {platform.machine()}, {os.cpu_count()} cores; two single-threaded runs at once.",
+        f"Machine: {platform.machine()}, {os.cpu_count()} cores; two single-threaded runs at once; "
+        "robustness: median (range) over 5 benchmark keys.",
         "",
-        "| recipe | robot | seed | after imitation | after SAC | after SNES | SAC | SNES |",
-        "|---|---|---|---|---|---|---|---|",
+        "| recipe | robot | seed | imitation | then SAC | then SNES | robustness | SAC | SNES |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:
         start = "" if r["imitation"] is None else f"{r['imitation']:.4f}"
         lines.append(
             f"| {r['recipe']} | {r['robot']} | {r['seed']} | {start} | {r['sac']['score']:.4f} | "
-            f"{r['snes']['score']:.4f} | {r['sac']['seconds']:.0f} s | "
+            f"{r['snes']['score']:.4f} | {r['robustness']['median']:.3f} "
+            f"({r['robustness']['lowest']:.3f} to {r['robustness']['highest']:.3f}) | "
+            f"{r['sac']['seconds']:.0f} s | "
             f"{r['snes']['seconds']:.0f} s |"
         )
     lines += [
         "",
-        "| recipe | robot | seeds | median | lowest | highest |",
+        "| recipe | robot | seeds | median score | lowest | highest |",
         "|---|---|---|---|---|---|",
     ]
     for recipe, robot in sorted({(r["recipe"], r["robot"]) for r in rows}):
