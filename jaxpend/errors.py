@@ -3,7 +3,7 @@
 __all__ = ["JaxpendError", "choose"]
 
 
-class JaxpendError(ValueError):
+class JaxpendError(Exception):
     """Bad input from a person: the message says what is wrong and what would be right."""
 
 

@@ -5,11 +5,14 @@ The definitions are those of the RealAIGym ``double_pendulum`` benchmark (Wiebe 
 accepts leading batch axes and can be jitted, vmapped and (where smooth) differentiated.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
 from ._struct import pytree
 from .controllers.base import Controller
+from .designs import active_joint, competition
 from .errors import JaxpendError
 from .plant import Plant
 from .rollout import rollout
@@ -22,6 +25,8 @@ __all__ = [
     "V2_OFFICIAL",
     "Criteria",
     "criteria",
+    "nominal",
+    "official",
     "performance",
     "score_v1",
     "score_v2",
@@ -177,11 +182,11 @@ def main(robot: str = "pendubot", policy: str | None = None, json: str | None = 
         policy: a policy file; by default the one that ships with the package.
         json: write the result as JSON to this file, or "-" for standard output.
     """
-    from . import cli, designs
+    from . import cli
     from .controllers.policy import load_policy, read_header
     from .report import score_table
 
-    designs.active_joint(robot)
+    active_joint(robot)
     loaded = load_policy(policy or robot, robot=robot)
     header = read_header(policy or robot)
     result = official(loaded, robot) | {"policy": policy or robot, "header": header}
@@ -190,13 +195,16 @@ def main(robot: str = "pendubot", policy: str | None = None, json: str | None = 
     cli.emit_json(result, json)
 
 
+@partial(jax.jit, static_argnames="robot")
+def nominal(controller: Controller, robot: str) -> Criteria:
+    """``performance`` on the plant of the v2 boards, compiled once a kind of controller."""
+    return performance(controller, competition(robot), jax.random.key(0))
+
+
 def official(controller: Controller, robot: str) -> dict:
     """Score, success and criteria of a controller as plain numbers, computed in float64."""
-    from .designs import competition
-
     with jax.enable_x64(True):
-        run = jax.jit(lambda c: performance(c, competition(robot), jax.random.key(0)))
-        c = run(controller)
+        c = nominal(controller, robot)
         names = [name for name in vars(c) if name != "success"]
         return {
             "robot": robot,

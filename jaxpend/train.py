@@ -14,7 +14,7 @@ from .errors import JaxpendError
 from .report import LiveProgress, console, score_table
 from .runs import RunFolder
 from .sac import SACConfig
-from .score import official, performance, score_v2
+from .score import nominal, official, score_v2
 from .snes import SNESConfig
 
 __all__ = ["Run", "SACRun", "SNESRun", "TrainRun", "train", "train_sac", "train_snes"]
@@ -63,13 +63,6 @@ class TrainRun(SACRun):
     snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
 
 
-@jax.jit
-def _nominal(policy: Policy):
-    """Score and criteria of the official run in the training precision."""
-    c = performance(policy, designs.competition(policy.robot), jax.random.key(0))
-    return score_v2(c), c
-
-
 def train_sac(config: SACConfig, seed: int, folder: RunFolder) -> Policy:
     """Train SAC; returns the policy with the best official score, and leaves it and the last one.
 
@@ -83,14 +76,14 @@ def train_sac(config: SACConfig, seed: int, folder: RunFolder) -> Policy:
     with LiveProgress("SAC", config.steps, f"{imitates}compiling ...") as progress:
         state = sac.init(config, jax.random.key(seed))
         best = sac.greedy_policy(config, state)
-        best_score = float(_nominal(best)[0])
+        best_score = float(score_v2(nominal(best, best.robot)))
         folder.log("sac", env_steps=0, updates=0, score=best_score)
         folder.save("sac_best.npz", best, stage="sac", env_steps=0, seed=seed)
         while int(state.env_steps) < config.steps:
             state, metrics = sac.train_chunk(config, state, steps)
             policy = sac.greedy_policy(config, state)
-            score, c = _nominal(policy)
-            env_steps, score = int(state.env_steps), float(score)
+            c = nominal(policy, policy.robot)
+            env_steps, score = int(state.env_steps), float(score_v2(c))
             counts = {"env_steps": env_steps, "updates": int(state.updates)}
             folder.log("sac", **counts, score=score, uptime=c.uptime, **metrics)
             if not all(math.isfinite(float(v)) for v in metrics.values()):
@@ -118,7 +111,7 @@ def train_snes(config: SNESConfig, start: Policy, seed: int, folder: RunFolder) 
     key_init, key_fresh = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
     state = snes.init(config, start, key_init)
     fresh_fitness = jax.jit(lambda policy, key: snes.fitness(config, policy, key)[0])
-    best, best_score, done = start, float(_nominal(start)[0]), 0
+    best, best_score, done = start, float(score_v2(nominal(start, start.robot))), 0
     folder.save("snes_best.npz", best, stage="snes", generation=0, seed=seed)
     with LiveProgress("SNES", config.generations) as progress:
         while done < config.generations:
@@ -132,7 +125,7 @@ def train_snes(config: SNESConfig, start: Policy, seed: int, folder: RunFolder) 
                 "individual": snes.best_policy(config, start, state),
             }
             for name, policy in candidates.items():
-                score = float(_nominal(policy)[0])
+                score = float(score_v2(nominal(policy, policy.robot)))
                 row[f"{name}_score"] = score
                 row[f"{name}_fresh_fitness"] = fresh_fitness(policy, key_now)
                 if score > best_score:

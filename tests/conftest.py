@@ -5,6 +5,7 @@ Import from here: ``from conftest import assert_close``.
 
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import hypothesis
 import jax
@@ -51,6 +52,25 @@ def excerpt(name: str) -> dict[str, np.ndarray]:
     """An excerpt of the reference simulator's numbers (``data/make_excerpts.py`` cut it)."""
     with np.load(Path(__file__).parent / "data" / f"{name}.npz") as arrays:
         return dict(arrays)
+
+
+@pytest.fixture(scope="session")
+def imitation():
+    """A policy that imitates the pendubot's swing-up, and the imitation that made it."""
+    from jaxpend.demonstrations import DemonstrationConfig, imitate, swingups  # load brax
+    from jaxpend.env import EnvConfig
+    from jaxpend.networks import Actor, to_policy
+
+    config = DemonstrationConfig(episodes=150, updates=8000, batch_size=512)
+    env, actor = EnvConfig("pendubot").make(), Actor((64, 64), "tanh")
+    keys = jax.random.split(jax.random.key(0), 3)
+    rows, wanted = swingups(config, env, keys[0], reward_scale=0.1)
+    untrained = actor.init(keys[1], jax.numpy.zeros(env.observation_size))
+    params, error = imitate(config, actor, env.observe, untrained, rows, wanted, keys[2])
+    return SimpleNamespace(
+        env=env, actor=actor, rows=rows, wanted=wanted, untrained=untrained, params=params,
+        error=error, policy=to_policy(params, actor, env.config),
+    )  # fmt: skip
 
 
 def plant_from(parameters, torque_limit, actuation) -> Plant:

@@ -1,0 +1,141 @@
+"""Demonstrations: exact transitions with usable labels, and what imitation makes of them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close
+
+from jaxpend import JaxpendError
+from jaxpend.controllers import Feedback, Zero
+from jaxpend.demonstrations import DemonstrationConfig, collect, swingups
+from jaxpend.env import EnvConfig
+from jaxpend.networks import to_policy
+from jaxpend.sac import ROW, SACConfig, init
+from jaxpend.score import official
+
+NOISY = DemonstrationConfig(episodes=4, duration=1.0, action_noise=0.4, kicks=0.5)
+
+
+def parts(rows):
+    """Columns of replay rows: state, previous action, action, reward, next state."""
+    rows = np.asarray(rows)
+    return rows[:, :4], rows[:, 4], rows[:, 5], rows[:, 6], rows[:, 7:]
+
+
+@pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
+def test_rows_are_exact_transitions_under_noise(robot):
+    env = EnvConfig(robot).make()
+    law = Feedback(lambda t, x: jnp.full(2, 2.0) * jnp.cos(3 * x[0]))
+    rows, wanted = collect(NOISY, env, law, jax.random.key(0), reward_scale=0.1)
+    assert rows.shape == (400, ROW)
+    x, previous, action, reward, next_x = parts(rows)
+    expected, earned = jax.vmap(env.advance)(x, previous, action)
+    assert_close(next_x, expected, times=5)
+    assert_close(reward, 0.1 * np.asarray(earned), times=5)
+    # The label is what the controller wanted, the action what it got.
+    assert_close(wanted, 2.0 * np.cos(3 * x[:, 0]) / 3.0, times=5)
+    assert np.abs(action - wanted).max() > 0.05
+    assert np.abs(action).max() <= 1
+    # Within an episode the action becomes the previous one, and only the velocity is kicked.
+    x, previous, action, next_x = (v.reshape(4, 100, -1) for v in (x, previous, action, next_x))
+    np.testing.assert_array_equal(previous[:, 1:], action[:, :-1])
+    assert not previous[:, 0].any()
+    np.testing.assert_array_equal(x[:, 1:, :2], next_x[:, :-1, :2])
+    kicks = (x[:, 1:, 2:] - next_x[:, :-1, 2:]).std(axis=(1, 2))
+    start = np.abs(x[:, 0]).max(axis=1)
+    assert np.all(kicks > 0)
+    assert kicks.max() < 0.5
+    assert np.all(start > 0)
+    # Each episode has its own amount of noise, the same share in everything.
+    disturbed = (action - wanted.reshape(4, 100, 1)).std(axis=(1, 2))
+    np.testing.assert_allclose(disturbed / 0.4, kicks / 0.5, rtol=0.3)
+    assert kicks.max() > 2 * kicks.min()
+
+
+def test_without_noise_every_episode_is_the_same():
+    quiet = dataclasses.replace(NOISY, action_noise=0.0, kicks=0.0, start_spread=0.0)
+    law = Feedback(lambda t, x: jnp.full(2, 2.0) * jnp.cos(3 * x[0]))
+    rows, wanted = collect(quiet, EnvConfig().make(), law, jax.random.key(0), reward_scale=1.0)
+    _, _, action, _, _ = parts(rows)
+    np.testing.assert_array_equal(action, wanted)
+    for episode in np.split(np.asarray(rows), 4):
+        np.testing.assert_array_equal(episode, rows[:100])
+
+
+def test_saturated_labels_are_left_out():
+    env = EnvConfig().make()
+    law = Feedback(lambda t, x: jnp.where(t < 0.495, 1.5, 9.0) * jnp.ones(2))
+    rows, wanted = collect(NOISY, env, law, jax.random.key(0), reward_scale=0.1)
+    assert rows.shape == (4 * 50, ROW)
+    assert_close(wanted, np.full(200, 0.5))
+    always = Feedback(lambda t, x: jnp.full(2, -3.0))
+    with pytest.raises(JaxpendError, match="asks for all the torque all the time"):
+        collect(NOISY, env, always, jax.random.key(0), reward_scale=0.1)
+
+
+def test_a_controller_that_wants_nothing_is_labelled_so():
+    _, wanted = collect(NOISY, EnvConfig().make(), Zero(), jax.random.key(0), reward_scale=0.1)
+    assert not np.asarray(wanted).any()
+
+
+def test_imitation_of_the_swing_up_swings_up(imitation):
+    env, actor = imitation.env, imitation.actor
+    assert np.abs(imitation.wanted).max() < 0.99
+    observations = jax.vmap(env.observe)(imitation.rows[:, :4], imitation.rows[:, 4])
+
+    def error(params):
+        mean, _ = actor.apply(params, observations)
+        return np.mean((np.tanh(mean[:, 0]) - imitation.wanted) ** 2)
+
+    assert error(imitation.params) < 0.2 * error(imitation.untrained)
+    np.testing.assert_allclose(imitation.error, error(imitation.params), rtol=0.5)
+    before = official(to_policy(imitation.untrained, actor, env.config), "pendubot")
+    after = official(imitation.policy, "pendubot")
+    assert after["success"]
+    assert after["score"] > before["score"] + 0.3
+
+
+def test_sac_starts_from_the_imitating_actor_and_its_demonstrations():
+    recipe = DemonstrationConfig(episodes=2, duration=1.0, updates=50, batch_size=32, log_std=-2.0)
+    config = SACConfig(
+        num_envs=4, replay_capacity=8, actor_hidden=(8,), critic_hidden=(8,), demonstrations=recipe
+    )
+    state = init(config, jax.random.key(0))
+    alone = dataclasses.replace(config, demonstrations=DemonstrationConfig())
+    untaught = init(alone, jax.random.key(0))
+    assert untaught.demonstrations is None
+    x, previous, action, reward, next_x = parts(state.demonstrations[:, :ROW])
+    expected, earned = jax.vmap(config.env.make().advance)(x, previous, action)
+    assert_close(next_x, expected, times=5)
+    assert_close(reward, config.reward_scale * np.asarray(earned), times=5)
+    assert state.demonstrations.shape == (len(x), ROW + 1)
+    head = state.actor["params"]["log_std"]
+    assert not np.asarray(head["kernel"]).any()
+    np.testing.assert_array_equal(head["bias"], [-2.0])
+
+
+def test_the_swing_up_is_that_of_the_robot():
+    recipe = DemonstrationConfig(episodes=1, duration=4.0, action_noise=0, kicks=0, start_spread=0)
+    for robot in ("acrobot", "pendubot"):
+        env = EnvConfig(robot).make()
+        rows, _ = swingups(recipe, env, jax.random.key(0), reward_scale=1.0)
+        upright = np.cos(np.asarray(rows)[-50:, :2]) @ [[-1.0], [1.0]]
+        np.testing.assert_allclose(upright, 2.0, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"episodes": -1}, "episodes is -1; it must not be negative"),
+        ({"duration": 0.0}, "duration is 0.0; it must be positive"),
+        ({"updates": 0}, "updates is 0; it must be positive"),
+        ({"learning_rate": -1.0}, "learning_rate is -1.0; it must be positive"),
+    ],
+)
+def test_senseless_values_are_one_sentence(values, words):
+    with pytest.raises(JaxpendError) as error:
+        DemonstrationConfig(**values)
+    assert str(error.value) == words

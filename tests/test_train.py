@@ -1,0 +1,235 @@
+"""The whole job and its commands: what is left on disk, and how each kind of bad input ends."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxpend import Policy, cli, load_policy, save_policy, score
+from jaxpend.controllers.policy import read_header
+from jaxpend.score import official
+from jaxpend.train import SACRun, SNESRun, TrainRun, command
+
+RECIPE = Path(__file__).parents[1] / "experiments" / "pendubot.yaml"
+CRITERIA = {
+    "swingup_time", "energy", "tau_cost", "tau_smoothness", "velocity_cost", "max_tau",
+    "integ_tau",
+}  # fmt: skip
+TINY = """
+    --seed 3 --sac.steps 128 --sac.eval-every 64 --sac.num-envs 8 --sac.batch-size 32
+    --sac.replay-capacity 64 --sac.critic-hidden 8 --sac.actor-hidden 8
+    --sac.demonstrations.episodes 2 --sac.demonstrations.duration 1
+    --sac.demonstrations.updates 20 --sac.demonstrations.batch-size 32
+"""
+FINE = "--snes.generations 3 --snes.population 4 --snes.chunk 2"
+
+
+def policy_file(folder, robot="pendubot"):
+    """A policy that does nothing useful, in a file."""
+    path = folder / f"{robot}.npz"
+    layers = ((jnp.full((6, 4), 0.3), jnp.zeros(4)), (jnp.ones((4, 1)), jnp.zeros(1)))
+    save_policy(path, Policy(layers, torque_limit=jnp.asarray(3.0), robot=robot))
+    return path
+
+
+def rows_of(folder, stage):
+    """Rows of ``metrics.jsonl`` of one stage."""
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    rows = [json.loads(line, parse_constant=pytest.fail) for line in lines]
+    return [row for row in rows if row["stage"] == stage]
+
+
+def run_command(monkeypatch, kind, *arguments):
+    """A training command in this process."""
+    monkeypatch.setattr("sys.argv", ["prog", *map(str, arguments)])
+    command(kind, "jaxpend.train", "words")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run folder that ``python -m jaxpend.train`` has left, and what it printed."""
+    runs = tmp_path_factory.mktemp("runs")
+    line = [sys.executable, "-m", "jaxpend.train", "--config", RECIPE, "--runs", runs]
+    line += [*TINY.split(), *FINE.split()]
+    done = subprocess.run(line, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return runs / "pendubot-seed3", done
+
+
+def test_a_run_leaves_its_configuration_metrics_policies_and_result(run):
+    folder, done = run
+    names = {"config.json", "metrics.jsonl", "result.json", "policy.npz"}
+    names |= {f"{stage}_{kept}.npz" for stage in ("sac", "snes") for kept in ("best", "last")}
+    assert {path.name for path in folder.iterdir()} == names
+    config = json.loads((folder / "config.json").read_text(), parse_constant=pytest.fail)
+    assert (config["seed"], config["robot"], config["sac"]["steps"]) == (3, "pendubot", 128)
+    assert [row["env_steps"] for row in rows_of(folder, "sac")] == [0, 64, 128]
+    assert [row["generation"] for row in rows_of(folder, "snes")] == [2, 3]
+    for stage in ("sac", "snes"):
+        assert all(0 <= row.get("score", 0) < 1 for row in rows_of(folder, stage))
+    # Progress from the first moment on, the results last; nothing on standard output.
+    assert done.stdout == ""
+    words = ["imitating demonstrations", "SAC 64/128", "SNES 2/3", "after SNES", str(folder.name)]
+    places = [done.stderr.replace("\n", "").index(word) for word in words]
+    assert places == sorted(places)
+
+
+def test_the_result_is_the_official_score_of_the_policy(run):
+    folder, _ = run
+    result = json.loads((folder / "result.json").read_text(), parse_constant=pytest.fail)
+    policy = load_policy(folder / "policy.npz", robot="pendubot")
+    again = official(policy, "pendubot")
+    assert result["score"] == result["snes"]["score"] == again["score"]
+    assert result["snes"]["criteria"] == again["criteria"]
+    assert set(result["sac"]["criteria"]) >= CRITERIA
+    assert result["snes"]["score"] >= result["sac"]["score"]
+    provenance = read_header(folder / "policy.npz")["provenance"]
+    assert (provenance["seed"], provenance["score"]) == (3, result["score"])
+    # The policy is the one that SNES kept, made of the one that SAC kept.
+    for name in ("sac_best", "sac_last", "snes_best", "snes_last"):
+        assert len(load_policy(folder / f"{name}.npz").layers) == len(policy.layers) == 2
+    kept = load_policy(folder / "snes_best.npz")
+    np.testing.assert_array_equal(kept.layers[0][0], policy.layers[0][0])
+
+
+def test_a_run_folder_is_not_overwritten(run, monkeypatch, capsys):
+    folder, _ = run
+    before = (folder / "result.json").read_bytes()
+    with pytest.raises(SystemExit) as exit_:
+        run_command(monkeypatch, TrainRun, "--seed", 3, "--runs", folder.parent)
+    assert exit_.value.code == 2
+    assert "already holds a run" in capsys.readouterr().err
+    assert (folder / "result.json").read_bytes() == before
+
+
+def test_snes_starts_from_a_policy_file(run, monkeypatch, tmp_path):
+    start = run[0] / "sac_best.npz"
+    options = ["--policy", start, "--runs", tmp_path, "--run", "fine", *FINE.split()]
+    run_command(monkeypatch, SNESRun, *options)
+    result = json.loads((tmp_path / "fine" / "result.json").read_text())
+    assert result["start"]["score"] == official(load_policy(start), "pendubot")["score"]
+    assert result["score"] >= result["start"]["score"]
+    names = {path.name for path in (tmp_path / "fine").iterdir()}
+    assert {"policy.npz", "snes_best.npz", "snes_last.npz"} <= names
+
+
+@pytest.fixture
+def _interruptible():
+    """Children can be interrupted, even if these tests run in the background of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_interruptible")
+def test_interrupt_leaves_the_best_policy_so_far(tmp_path):
+    line = [sys.executable, "-m", "jaxpend.train", *TINY.split(), "--runs", tmp_path]
+    line += ["--run", "stopped", "--sac.steps", "100_000_000", "--sac.demonstrations.episodes", "0"]
+    process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    best = tmp_path / "stopped" / "sac_best.npz"
+    try:
+        while not best.exists() and process.poll() is None:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=300)
+    finally:
+        process.kill()
+    assert process.returncode == 130, err
+    assert out == ""
+    assert "stopped; the best policies so far are in" in err
+    assert "Traceback" not in err
+    load_policy(best, robot="pendubot")
+    assert not (tmp_path / "stopped" / "result.json").exists()
+
+
+def one_sentence(err):
+    """The last line on standard error, after checking that it is the only one that complains."""
+    assert "Traceback" not in err
+    lines = [line for line in err.splitlines() if line.startswith(("jaxpend.", "prog:"))]
+    assert len(lines) == 1, err
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "words"),
+    [
+        (SNESRun, "--policy {}/nothing.npz", "there is no policy file"),
+        (SNESRun, "--policy {}/acrobot.npz", "is a policy for the acrobot, not for the pendubot"),
+        (SNESRun, "--policy {}/empty.npz", "is not a policy file, or it is empty or cut off"),
+        (SNESRun, "--policy {}/cut.npz", "is not a policy file, or it is empty or cut off"),
+        (SNESRun, "--snes.population 1", "population is 1"),
+        (SACRun, "--sac.env.torque-limit 0", "torque_limit is 0.0; it must be positive"),
+        (TrainRun, "--sac.env.torque-limit -3", "torque_limit is -3.0; it must be positive"),
+        (TrainRun, "--robot cartpole", "unknown robot 'cartpole'; known: acrobot, pendubot"),
+        (TrainRun, "--config {}/nothing.yaml", "there is no configuration file"),
+        (TrainRun, "--config {}/unknown.yaml", "unknown field 'stepz'; known: env, steps"),
+        (TrainRun, "--runs {}/acrobot.npz", "cannot use"),
+    ],
+)
+def test_bad_input_to_training_is_one_sentence(monkeypatch, capsys, tmp_path, kind, options, words):
+    whole = policy_file(tmp_path, "acrobot").read_bytes()
+    (tmp_path / "empty.npz").write_bytes(b"")
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "unknown.yaml").write_text("sac: {stepz: 4}")
+    before = set(tmp_path.rglob("*"))
+    options = options.format(tmp_path).split()
+    runs = [] if "--runs" in options else ["--runs", tmp_path / "runs"]
+    with pytest.raises(SystemExit) as exit_:
+        run_command(monkeypatch, kind, *runs, *options)
+    assert exit_.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert words in one_sentence(err)
+    assert set(tmp_path.rglob("*")) == before
+
+
+def test_unknown_options_of_training_exit_with_2(monkeypatch, capsys, tmp_path):
+    with pytest.raises(SystemExit) as exit_:
+        run_command(monkeypatch, TrainRun, "--runs", tmp_path, "--sac.stepz", 4)
+    assert exit_.value.code == 2
+    out, err = capsys.readouterr()
+    assert (out, list(tmp_path.iterdir())) == ("", [])
+    assert "--sac.stepz" in err
+    assert "Traceback" not in err
+
+
+def test_score_command_prints_json_and_nothing_else(tmp_path):
+    path = policy_file(tmp_path)
+    line = [sys.executable, "-m", "jaxpend.score", "--robot", "pendubot"]
+    line += ["--policy", path, "--json", "-"]
+    done = subprocess.run(line, capture_output=True, text=True, check=True)
+    result = json.loads(done.stdout, parse_constant=pytest.fail)
+    assert set(result["criteria"]) >= CRITERIA
+    expected = official(load_policy(path), "pendubot")
+    assert {name: result[name] for name in expected} == expected
+    assert (result["success"], result["score"]) == (False, 0.0)
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--policy {}/nothing.npz", "there is no policy file"),
+        ("--policy {}/acrobot.npz", "is a policy for the acrobot, not for the pendubot"),
+        ("--policy {}/empty.npz", "is not a policy file, or it is empty or cut off"),
+        ("--robot cartpole --policy {}/acrobot.npz", "unknown robot 'cartpole'; known: acrobot"),
+    ],
+)
+def test_bad_input_to_the_score_command_is_one_sentence(
+    monkeypatch, capsys, tmp_path, options, words
+):
+    policy_file(tmp_path, "acrobot")
+    (tmp_path / "empty.npz").write_bytes(b"")
+    monkeypatch.setattr("sys.argv", ["prog", *options.format(tmp_path).split(), "--json", "-"])
+    with pytest.raises(SystemExit) as exit_:
+        cli.run(score.main, "jaxpend.score")
+    assert exit_.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert words in one_sentence(err)
