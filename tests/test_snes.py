@@ -1,0 +1,187 @@
+"""SNES: the sign, the noise that all share, what is searched, and what a lost run counts for."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close
+
+from jaxpend import JaxpendError, Policy, designs, snes
+from jaxpend.score import official, performance, score_v2
+from jaxpend.snes import SNESConfig
+
+KEY = jax.random.key(0)
+TOY = Policy(
+    layers=((jnp.zeros((6, 3)), jnp.zeros(3)), (jnp.zeros((3, 1)), jnp.zeros(1))),
+    torque_limit=jnp.asarray(3.0),
+)
+
+
+def distance(policy):
+    """Squared distance of the parameters to 0.1."""
+    return sum(jnp.sum((leaf - 0.1) ** 2) for leaf in jax.tree.leaves(policy.layers))
+
+
+@pytest.fixture
+def toy_fitness(monkeypatch):
+    """A fitness that is largest where every parameter is 0.1, with one noise a generation."""
+
+    def fitness(config, policy, key):
+        return jax.random.normal(key) - distance(policy), jnp.zeros((), jnp.int32)
+
+    monkeypatch.setattr(snes, "fitness", fitness)
+    snes.evolve.clear_cache()
+    yield
+    snes.evolve.clear_cache()
+
+
+def evolved(config, policy, generations):
+    """State and metrics after some generations."""
+    return snes.evolve(config, policy, snes.init(config, policy, KEY), generations)
+
+
+def test_the_search_climbs_the_fitness(toy_fitness):
+    config = SNESConfig(generations=40, population=20, sigma=0.03)
+    state, _ = evolved(config, TOY, 40)
+    found = snes.mean_policy(config, TOY, state)
+    assert distance(found) < 0.2 * distance(TOY)
+    assert np.mean(np.asarray(found.layers[0][0])) > 0.05
+
+
+def test_best_individual_is_the_one_with_the_best_fitness_so_far(toy_fitness):
+    config = SNESConfig(generations=5, population=6)
+    state, metrics = snes.init(config, TOY, KEY), []
+    for _ in range(5):
+        state, row = snes.evolve(config, TOY, state, 1)
+        assert row["max_fitness"] >= row["mean_fitness"]
+        metrics.append(float(row["max_fitness"][0]))
+        assert_close(state.best_fitness, max(metrics))
+    best = snes.best_policy(config, TOY, state)
+    # The noise is one number a generation, the rest is the distance.
+    offset = [float(state.best_fitness + distance(best)), *metrics]
+    assert np.isfinite(offset).all()
+    assert distance(best) < 1.1 * distance(TOY)
+
+
+def test_only_what_is_searched_changes(toy_fitness):
+    for searched in ("all", "hidden"):
+        config = SNESConfig(generations=3, population=4, searched=searched)
+        state, _ = evolved(config, TOY, 3)
+        for found in (snes.mean_policy(config, TOY, state), snes.best_policy(config, TOY, state)):
+            assert jax.tree.structure(found) == jax.tree.structure(TOY)
+            assert np.all(np.asarray(found.layers[0][0]) != 0)
+            assert np.all(np.asarray(found.layers[0][1]) != 0)
+            changed = [bool(np.any(np.asarray(leaf) != 0)) for leaf in found.layers[1]]
+            assert changed == [searched == "all"] * 2
+
+
+def test_sigma_decays_to_its_final_fraction(monkeypatch):
+    flat = lambda config, policy, key: (jnp.zeros(()), jnp.zeros((), jnp.int32))  # noqa: E731
+    monkeypatch.setattr(snes, "fitness", flat)
+    sigmas = {}
+    for final in (1.0, 0.25):
+        snes.evolve.clear_cache()
+        config = SNESConfig(generations=8, population=4, sigma=0.02, final_sigma=final)
+        assert_close(snes.init(config, TOY, KEY).strategy.std, np.full(25, 0.02))
+        sigmas[final] = np.asarray(evolved(config, TOY, 8)[1]["sigma"])
+    snes.evolve.clear_cache()
+    # The search adapts sigma too; the schedule is what differs.
+    assert_close(sigmas[0.25] / sigmas[1.0], 0.25 ** (np.arange(1, 9) / 8), times=10)
+
+
+def test_an_individual_that_is_nan_is_last_and_counted_and_poisons_nothing(monkeypatch):
+    def fitness(config, policy, key):
+        sick = policy.layers[0][1][0] > 0
+        kernel = jnp.where(sick, jnp.nan, policy.layers[0][0])
+        layers = ((kernel, policy.layers[0][1]), policy.layers[1])
+        plant = designs.competition(policy.robot)
+        c = performance(policy.replace(layers=layers), plant, key, duration=0.02)
+        score = score_v2(dataclasses.replace(c, swingup_time=0.0, success=c.tau_cost >= 0))
+        return score, jnp.sum(~jnp.isfinite(c.velocity_cost))
+
+    monkeypatch.setattr(snes, "fitness", fitness)
+    snes.evolve.clear_cache()
+    config = SNESConfig(generations=4, population=10, sigma=0.05)
+    state, metrics = evolved(config, TOY, 4)
+    snes.evolve.clear_cache()
+    assert 0 < state.diverged < 40
+    assert np.isfinite(state.strategy.mean).all()
+    assert np.isfinite(state.best_fitness)
+    assert np.all(metrics["mean_fitness"] > 0)
+    # The search walks away from where individuals are lost.
+    assert snes.mean_policy(config, TOY, state).layers[0][1][0] < 0
+
+
+def lost(policy):
+    """A policy whose torque overflows."""
+    return policy.replace(torque_limit=jnp.asarray(jnp.nan, jnp.float32))
+
+
+@pytest.fixture(scope="module")
+def fit():
+    """``snes.fitness``, jitted."""
+    return jax.jit(snes.fitness, static_argnums=0)
+
+
+QUIET = SNESConfig(action_noise=0.0, rollouts=3)
+
+
+def test_fitness_without_noise_is_the_official_score(imitation, fit):
+    score, diverged = fit(QUIET, imitation.policy, KEY)
+    np.testing.assert_allclose(score, official(imitation.policy, "pendubot")["score"], atol=2e-3)
+    assert diverged == 0
+    np.testing.assert_array_equal(fit(QUIET, imitation.policy, jax.random.key(1))[0], score)
+    score, diverged = fit(QUIET, lost(imitation.policy), KEY)
+    assert (float(score), int(diverged)) == (0.0, 1)
+
+
+def test_fitness_is_the_mean_over_rollouts_with_noisy_actions(imitation, fit):
+    config = SNESConfig(action_noise=0.05, rollouts=2)
+    score, diverged = fit(config, imitation.policy, KEY)
+    quiet, _ = fit(QUIET, imitation.policy, KEY)
+    assert 0 < score < quiet - 0.01  # noise costs smoothness
+    assert diverged == 0
+    np.testing.assert_array_equal(fit(config, imitation.policy, KEY)[0], score)
+    assert fit(config, imitation.policy, jax.random.key(1))[0] != score
+    # Lost runs are worth nothing, and each of them is counted.
+    score, diverged = fit(config, lost(imitation.policy), KEY)
+    assert (float(score), int(diverged)) == (0.0, 2)
+
+
+def test_a_generation_meets_one_noise_and_improves_the_policy(imitation, fit):
+    *hidden, (kernel, bias) = imitation.policy.layers
+    off = imitation.policy.replace(layers=(*hidden, (kernel, bias + 0.05)))
+    config = SNESConfig(generations=10, population=12, sigma=0.003, action_noise=0.02)
+    # Common random numbers: individuals that are equal to rounding are equally fit.
+    alike = snes.init(dataclasses.replace(config, sigma=1e-20), off, KEY)
+    _, metrics = snes.evolve(config, off, alike, 10)
+    np.testing.assert_allclose(metrics["max_fitness"], metrics["mean_fitness"], rtol=1e-6)
+    assert len(np.unique(metrics["max_fitness"])) == 10  # new noise in every generation
+    state, metrics = evolved(dataclasses.replace(config, generations=25, sigma=0.005), off, 25)
+    means = np.asarray(metrics["mean_fitness"])
+    assert means[-3:].mean() > means[:3].mean() + 0.003
+    found = snes.mean_policy(config, off, state)
+    assert fit(QUIET, found, KEY)[0] > fit(QUIET, off, KEY)[0]
+    assert state.diverged == 0
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"population": 1}, "population is 1; SNES compares at least two individuals"),
+        ({"population": 0}, "population is 0; it must be positive"),
+        ({"sigma": 0.0}, "sigma is 0.0; it must be positive"),
+        ({"action_noise": -0.1}, "action_noise is -0.1; it must not be negative"),
+        ({"action_noise": float("nan")}, "action_noise is nan; it must not be negative"),
+        ({"searched": "some"}, "unknown choice of searched parameters 'some'; known: all, hidden"),
+        ({"scenarios": -1}, "scenarios must not be negative"),
+        ({"scenario_weight": 1.5}, "scenario_weight lies in 0 to 1"),
+    ],
+)
+def test_senseless_values_are_one_sentence(values, words):
+    with pytest.raises(JaxpendError) as error:
+        SNESConfig(**values)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
