@@ -1,0 +1,65 @@
+"""Random scenarios: one imperfection each, within the ranges of the benchmark's grids."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxpend.designs import competition
+from jaxpend.randomisation import LONGEST_DELAY, sample
+from jaxpend.robustness import strips
+
+PLANT = competition("acrobot")
+NOMINAL = {name: np.asarray(value) for name, value in vars(PLANT).items()}
+
+
+@pytest.fixture(scope="module")
+def scenarios():
+    """2000 of them, as numpy arrays."""
+    keys = jax.random.split(jax.random.key(0), 2000)
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(lambda key: sample(PLANT, key)))(keys))
+
+
+def off(scenarios):
+    """Which of the six criteria each scenario has something of, (6, n)."""
+    plant = [np.asarray(getattr(scenarios.plant, name)) != NOMINAL[name] for name in NOMINAL]
+    return np.stack(
+        [
+            np.any([p.reshape(len(p), -1).any(axis=1) for p in plant], axis=0),
+            scenarios.measurement_noise.any(axis=1),
+            scenarios.torque_noise.any(axis=1),
+            scenarios.responsiveness != 1,
+            scenarios.delay.any(axis=1),
+            scenarios.pulses.amplitude.any(axis=(1, 2)),
+        ]
+    )
+
+
+def test_one_thing_is_wrong_and_each_is_a_sixth(scenarios):
+    wrong = off(scenarios)
+    assert wrong.sum(axis=0).max() == 1
+    share = wrong.mean(axis=1)
+    # Four standard deviations of a share of 1/6 in 2000 draws; a delay may round to none.
+    np.testing.assert_allclose(share, 1 / 6, atol=4 * np.sqrt(5 / 36 / 2000))
+
+
+def test_ranges_are_those_of_the_benchmarks_grids(scenarios):
+    grids = {strip.variation: strip.values for strip in strips(PLANT)}
+    plant = scenarios.plant
+    drawn = {
+        "Ir": plant.motor_inertia, "m1r1": NOMINAL["mass"][0] * plant.com[:, 0],
+        "I1": plant.inertia[:, 0], "b1": plant.damping[:, 0],
+        "cf1": plant.coulomb_friction[:, 0], "m2r2": NOMINAL["mass"][1] * plant.com[:, 1],
+        "m2": plant.mass[:, 1], "I2": plant.inertia[:, 1], "b2": plant.damping[:, 1],
+        "cf2": plant.coulomb_friction[:, 1], "velocity_noise": scenarios.measurement_noise[:, 2],
+        "torque_noise": scenarios.torque_noise[:, 1],
+        "responsiveness": scenarios.responsiveness, "delay": 0.002 * scenarios.delay[:, 0],
+    }  # fmt: skip
+    for name, values in drawn.items():
+        low, high = grids[name].min(), grids[name].max()
+        width = high - low
+        assert values.min() >= low - 1e-6 * width, name
+        assert values.max() <= high + 1e-6 * width, name
+        assert values.max() - values.min() > 0.75 * width, name
+    assert scenarios.delay.max() == LONGEST_DELAY
+    assert not scenarios.torque_noise[:, 0].any()
+    assert not scenarios.measurement_noise[:, :2].any()
