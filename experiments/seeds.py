@@ -1,6 +1,6 @@
 """Train several seeds of both robots, two single-threaded runs at a time, and tabulate them.
 
-    python experiments/seeds.py --recipes shipped plain --seeds 0 1 2
+    python experiments/seeds.py --seeds 0 1 2
 
 writes experiments/seeds.json and experiments/seeds.md. A run that is already there is kept, so
 an interrupted sweep goes on where it was.
@@ -19,6 +19,15 @@ import numpy as np
 
 HERE = Path(__file__).parent
 ROBOTS = ("acrobot", "pendubot")
+# What a recipe changes of the robot's own; "plain" has a file of its own.
+RECIPES = {
+    "shipped": [],
+    "calm": [  # demonstrations as they were first: no pulses, half the torque
+        "--sac.env.torque-limit", "3", "--sac.demonstrations.pulses", "0",
+        "--sac.demonstrations.duration", "4", "--sac.demonstrations.updates", "20000",
+    ],
+    "plain": [],
+}  # fmt: skip
 # One thread a run: two runs side by side use two cores better than one run does.
 THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
@@ -36,7 +45,7 @@ def train(recipe: str, robot: str, seed: int, runs: Path) -> dict:
     """One run of `python -m jaxpend.train`; returns a row of the table."""
     folder = runs / f"{recipe}-{robot}-{seed}"
     if not (folder / "result.json").exists():
-        config = HERE / f"{robot if recipe == 'shipped' else recipe}.yaml"
+        config = HERE / f"{recipe if recipe == 'plain' else robot}.yaml"
         command = [sys.executable, "-m", "jaxpend.train", "--config", str(config)]
         command += [
             "--robot",
@@ -59,7 +68,7 @@ def train(recipe: str, robot: str, seed: int, runs: Path) -> dict:
         "recipe": recipe,
         "robot": robot,
         "seed": seed,
-        "imitation": first["score"] if recipe == "shipped" else None,
+        "imitation": None if recipe == "plain" else first["score"],
         "sac": {k: result["sac"][k] for k in keys},
         "snes": {k: result["snes"][k] for k in keys},
         "criteria": result["snes"]["criteria"],
@@ -102,7 +111,7 @@ def table(rows: list[dict]) -> str:
 def main() -> None:
     """Run what is missing and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--recipes", nargs="+", default=["shipped", "plain"])
+    parser.add_argument("--recipes", nargs="+", default=list(RECIPES), choices=RECIPES)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--robots", nargs="+", default=ROBOTS, choices=ROBOTS)
     parser.add_argument("--runs", type=Path, default=Path("runs/seeds"))
