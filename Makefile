@@ -8,6 +8,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
+ifeq ($(filter $(ROBOT),acrobot pendubot),)
+$(error ROBOT is '$(ROBOT)'; it must be acrobot or pendubot)
+endif
+
 .DEFAULT_GOAL := help
 .PHONY: help install train snes score robustness leaderboard test lint bench clean
 
