@@ -2,8 +2,8 @@
 
     python experiments/seeds.py --seeds 0 1 2
 
-writes experiments/seeds.json and experiments/seeds.md. A run that is already there is kept, so
-an interrupted sweep goes on where it was.
+writes experiments/seeds.json and experiments/seeds.md (or what --out names). A run that is already
+there is kept, so an interrupted sweep goes on where it was.
 """
 
 import argparse
@@ -57,6 +57,7 @@ def train(recipe: str, robot: str, seed: int, runs: Path) -> dict:
             "--run",
             folder.name,
         ]
+        command += RECIPES[recipe]
         environment = os.environ | {"XLA_FLAGS": THREAD}
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
         if done.returncode:
@@ -111,17 +112,18 @@ def table(rows: list[dict]) -> str:
 def main() -> None:
     """Run what is missing and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--recipes", nargs="+", default=list(RECIPES), choices=RECIPES)
+    parser.add_argument("--recipes", nargs="+", default=["shipped", "plain"], choices=RECIPES)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--robots", nargs="+", default=ROBOTS, choices=ROBOTS)
     parser.add_argument("--runs", type=Path, default=Path("runs/seeds"))
+    parser.add_argument("--out", default="seeds", help="name of the .json and .md beside this file")
     parser.add_argument("--jobs", type=int, default=2)
     args = parser.parse_args()
     jobs = [(c, r, s, args.runs) for c in args.recipes for r in args.robots for s in args.seeds]
     with concurrent.futures.ThreadPoolExecutor(args.jobs) as pool:
         rows = list(pool.map(lambda job: train(*job), jobs))
-    (HERE / "seeds.json").write_text(json.dumps(rows, indent=1) + "\n")
-    (HERE / "seeds.md").write_text(table(rows))
+    (HERE / f"{args.out}.json").write_text(json.dumps(rows, indent=1) + "\n")
+    (HERE / f"{args.out}.md").write_text(table(rows))
     print(table(rows))
 
 
