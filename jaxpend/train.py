@@ -26,7 +26,7 @@ class Run:
 
     robot: str = "pendubot"
     seed: int = 0
-    run: str = ""  # name of the run folder; empty: ROBOT-seedSEED
+    run: str = ""  # name of the run folder; empty: ROBOT-seedSEED, or ROBOT-snes-seedSEED
     runs: str = "runs"  # folder of the run folders
 
     def __post_init__(self):
@@ -38,7 +38,9 @@ class Run:
     @property
     def folder(self) -> Path:
         """Path of the run folder."""
-        return Path(self.runs) / (self.run or f"{self.robot}-seed{self.seed}")
+        # A stage alone must not land in the folder of the whole run that it may start from.
+        stage = {SACRun: "-sac", SNESRun: "-snes"}.get(type(self), "")
+        return Path(self.runs) / (self.run or f"{self.robot}{stage}-seed{self.seed}")
 
 
 @dataclasses.dataclass(frozen=True)
