@@ -18,8 +18,8 @@ import numpy as np
 from jaxpend import Policy, cli
 from jaxpend.designs import competition
 from jaxpend.observation import Observation
-from jaxpend.report import console
 from jaxpend.robustness import benchmark
+from jaxpend.terminal import console
 
 STEPS, RUNS = 5000, 722
 

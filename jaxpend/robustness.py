@@ -299,7 +299,7 @@ def _table(result: dict[str, Any], robot: str) -> None:
     """Six percentages and the overall score, on standard error like all reports."""
     from rich.table import Table
 
-    from .report import console
+    from .terminal import console
 
     table = Table(title=f"{robot}: robustness, {result['simulations']} runs of 10 s")
     for heading in ("", "score [%]", "over keys [%]", "diverged"):

@@ -184,7 +184,7 @@ def main(robot: str = "pendubot", policy: str | None = None, json: str | None = 
     """
     from . import cli
     from .controllers.policy import load_policy, read_header
-    from .report import score_table
+    from .terminal import score_table
 
     active_joint(robot)
     loaded = load_policy(policy or robot, robot=robot)

@@ -11,11 +11,11 @@ import jax
 from . import cli, designs, sac, snes
 from .controllers.policy import Policy, load_policy
 from .errors import JaxpendError
-from .report import LiveProgress, console, score_table
 from .runs import RunFolder
 from .sac import SACConfig
 from .score import nominal, official, score_v2
 from .snes import SNESConfig
+from .terminal import LiveProgress, console, score_table
 
 __all__ = ["Run", "SACRun", "SNESRun", "TrainRun", "train", "train_sac", "train_snes"]
 
