@@ -7,10 +7,11 @@ python experiments/leaderboard.py --controllers tvlqr    only these rows; the ot
 import json
 from pathlib import Path
 
-from jaxpend import cli, designs, leaderboard, report
+from jaxpend import cli, designs, leaderboard
 from jaxpend.controllers.known import KNOWN, build
 from jaxpend.errors import choose
 from jaxpend.files import write_atomically
+from jaxpend.terminal import console
 
 HERE = Path(__file__).parent
 # Those that need a policy file are judged by the experiments that make one.
@@ -45,7 +46,7 @@ def main(
             for name in names
         }
         board = leaderboard.leaderboard(
-            robot, chosen, say=report.console.print, keys=keys, seed=seed, robustness=robustness
+            robot, chosen, say=console.print, keys=keys, seed=seed, robustness=robustness
         )
         rows = board["rows"] + kept(robot, names, path)
         board["rows"] = sorted(rows, key=lambda row: -row["score"])

@@ -11,7 +11,8 @@ from typing import Any
 
 import jax
 
-from . import cli, designs, report
+from . import cli, designs
+from .boards import HEADINGS, PUBLISHED
 from .controllers.base import Controller
 from .controllers.known import KNOWN, build
 from .controllers.policy import load_policy
@@ -19,48 +20,20 @@ from .errors import JaxpendError, choose
 from .files import write_atomically
 from .robustness import CRITERIA, benchmark
 from .score import official
+from .terminal import console
 
 __all__ = ["judge", "leaderboard", "markdown", "published"]
 
-# What the boards show for the classical controllers: performance and robustness.
-CLASSICAL = {
-    "acrobot": {
-        "TVLQR": (0.504, 0.607),
-        "iLQR MPC": (0.345, 0.343),
-        "iLQR Riccati gains": (0.396, 0.138),
-    },
-    "pendubot": {
-        "TVLQR": (0.526, 0.767),
-        "iLQR MPC": (0.353, 0.674),
-        "iLQR Riccati gains": (0.536, 0.255),
-    },
-}
-# Robustness of the learned ones whose performance ``report.PUBLISHED`` has.
-LEARNED_ROBUSTNESS = {
-    "acrobot": {"Evolutionary SAC": 0.692, "HistorySAC": 0.751, "AR-EAPO": 0.727},
-    "pendubot": {"Evolutionary SAC": 0.796, "HistorySAC": 0.770, "AR-EAPO": 0.913},
-}
-HEADINGS = {
-    "swingup_time": ("swing-up [s]", ".2f"),
-    "energy": ("energy [J]", ".2f"),
-    "tau_cost": ("torque cost [N²m²s]", ".2f"),
-    "tau_smoothness": ("smoothness [N m]", ".4f"),
-    "velocity_cost": ("velocity cost [rad²/s]", ".1f"),
-}
 # Headings for a terminal, in the order of ``HEADINGS`` and of ``CRITERIA``.
 SHORT = ("up s", "J", "torque²", "steps", "speed²")
 SHORT_ROBUSTNESS = ("model", "vel.", "torque", "resp.", "delay", "pulses")
 
 
 def published(robot: str) -> list[dict[str, Any]]:
-    """The rows of the boards: title, score and robustness (None where none is known)."""
-    learned = {
-        name: (score, LEARNED_ROBUSTNESS[robot].get(name))
-        for name, score in report.PUBLISHED[robot].items()
-    }
+    """The rows of the boards: title, score and robustness."""
     return [
         {"title": title, "source": "published", "score": score, "robustness": robustness}
-        for title, (score, robustness) in (learned | CLASSICAL[robot]).items()
+        for title, (score, robustness) in PUBLISHED[robot].items()
     ]
 
 
@@ -127,14 +100,14 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
     return [
         title,
         shown(row["score"], ".3f"),
-        *(shown(criteria[name], form) for name, (_, form) in HEADINGS.items()),
+        *(shown(criteria[name], form) for name, (_, _, form) in HEADINGS.items()),
         *(shown(six[name], ".2f") for name in CRITERIA),
         shown(row["robustness"], ".3f"),
     ]
 
 
 def _headings() -> list[str]:
-    criteria = [heading for heading, _ in HEADINGS.values()]
+    criteria = [f"{heading} [{unit}]" for heading, unit, _ in HEADINGS.values()]
     return ["controller", "score", *criteria, *CRITERIA.values(), "robustness"]
 
 
@@ -163,7 +136,7 @@ def _show(board: Mapping[str, Any]) -> None:
             style = "dim" if row["source"] == "published" else None
             name = row["title"] + ("*" if row["source"] == "published" else "")
             table.add_row(name, *(cells[heading] for heading in headings), style=style)
-        report.console.print(table)
+        console.print(table)
 
 
 def _ships_policy(robot: str) -> bool:
@@ -217,7 +190,7 @@ def main(
     """
     choose("robot", robot, designs.ROBOTS)
     chosen = _chosen(controllers, policy, robot)
-    say = lambda line: report.console.print(line, style="dim")  # noqa: E731
+    say = lambda line: console.print(line, style="dim")  # noqa: E731
     options = {"robustness": robustness, "keys": keys, "seed": seed}
     board = leaderboard(robot, chosen, say=say, **options)
     _show(board)

@@ -7,23 +7,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-__all__ = ["PUBLISHED", "LiveProgress", "console", "score_table"]
+from .boards import HEADINGS, PUBLISHED
+
+__all__ = ["LiveProgress", "console", "score_table"]
 
 # Progress and tables go to standard error, so that standard output stays machine-readable.
 console = Console(stderr=True)
-
-# Performance scores on the v2 boards, as published (arXiv 2409.08938 and the boards).
-PUBLISHED = {
-    "acrobot": {"Evolutionary SAC": 0.524, "HistorySAC": 0.655, "AR-EAPO": 0.633},
-    "pendubot": {"Evolutionary SAC": 0.596, "HistorySAC": 0.682, "AR-EAPO": 0.659},
-}
-_ROWS = {
-    "swingup_time": ("swing-up time [s]", ".3f"),
-    "energy": ("energy [J]", ".2f"),
-    "tau_cost": ("torque cost [N²m²s]", ".2f"),
-    "tau_smoothness": ("torque smoothness [N m]", ".4f"),
-    "velocity_cost": ("velocity cost [rad²/s]", ".1f"),
-}
 
 
 def score_table(results: Mapping[str, Mapping], robot: str) -> None:
@@ -34,10 +23,11 @@ def score_table(results: Mapping[str, Mapping], robot: str) -> None:
         table.add_column(name, justify="right")
     table.add_row("score", *(f"[bold]{r['score']:.4f}[/bold]" for r in results.values()))
     table.add_row("success", *("yes" if r["success"] else "no" for r in results.values()))
-    for key, (heading, form) in _ROWS.items():
-        table.add_row(heading, *(format(r["criteria"][key], form) for r in results.values()))
+    for key, (heading, unit, form) in HEADINGS.items():
+        cells = (format(r["criteria"][key], form) for r in results.values())
+        table.add_row(f"{heading} \\[{unit}]", *cells)
     console.print(table)
-    published = ", ".join(f"{name} {score:.3f}" for name, score in PUBLISHED[robot].items())
+    published = ", ".join(f"{name} {score:.3f}" for name, (score, _) in PUBLISHED[robot].items())
     console.print(f"published: {published}", style="dim")
 
 
