@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -19,7 +20,8 @@ T = TypeVar("T")
 def guard(prog: str) -> Iterator[None]:
     """Turn what goes wrong in a command into one sentence on standard error and an exit code.
 
-    2 for a ``JaxpendError`` or an unusable file system, 130 after Ctrl-C.
+    2 for a ``JaxpendError`` or an unusable file system, 130 after Ctrl-C, 143 after SIGTERM where
+    a command waits for a good moment to stop (``interrupt.Stopped``).
     """
     try:
         yield
@@ -30,9 +32,9 @@ def guard(prog: str) -> Iterator[None]:
         where = f" {error.filename}" if error.filename else ""
         print(f"{prog}: cannot use{where}: {error.strerror or error}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
-        print(f"{prog}: interrupted", file=sys.stderr)
-        sys.exit(130)
+    except KeyboardInterrupt as stop:
+        print(f"{prog}: {str(stop) or 'interrupted'}", file=sys.stderr)
+        sys.exit(128 + getattr(stop, "signum", signal.SIGINT))
 
 
 def run(main: Callable[..., None], prog: str) -> NoReturn:

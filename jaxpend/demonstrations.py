@@ -19,12 +19,14 @@ from . import designs
 from .controllers.base import Controller
 from .env import DoublePendulum
 from .errors import JaxpendError
+from .interrupt import stop_if_asked
 from .networks import Actor
 from .scenario import random_pulses
 
 __all__ = ["DemonstrationConfig", "collect", "imitate", "swingups"]
 
 SATURATED = 0.99  # of the torque limit
+CHUNK = 2000  # imitation updates in one compiled call
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +118,6 @@ def swingups(
     return collect(config, env, controller, key, reward_scale=reward_scale)
 
 
-@partial(jax.jit, static_argnames=("config", "actor", "observe"))
 def imitate(
     config: DemonstrationConfig,
     actor: Actor,
@@ -131,22 +132,36 @@ def imitate(
     Minimises the mean squared error of tanh(mean). ``observe`` maps a state (4,) and the previous
     action () to an observation. ``key`` is consumed.
     """
-    schedule = optax.cosine_decay_schedule(config.learning_rate, config.updates, 1e-3)
-    optimizer = optax.adam(schedule)
-    obs = jax.vmap(observe)(rows[:, :4], rows[:, 4])
+    obs = jax.jit(jax.vmap(observe))(rows[:, :4], rows[:, 4])
+    opt_state, errors = _adam(config).init(params), []
+    keys = jax.random.split(key, config.updates)
+    for first in range(0, config.updates, CHUNK):
+        stop_if_asked()
+        now = keys[first : first + CHUNK]
+        params, opt_state, error = _fit(config, actor, params, opt_state, obs, wanted, now)
+        errors.append(error)
+    return params, jnp.concatenate(errors)[-100:].mean()
+
+
+def _adam(config: DemonstrationConfig) -> optax.GradientTransformation:
+    return optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.updates, 1e-3))
+
+
+@partial(jax.jit, static_argnames=("config", "actor"))
+def _fit(config, actor, params, opt_state, obs, wanted, keys):
+    """An update for each key; returns parameters, optimiser state and losses."""
 
     def step(carry, key):
         params, opt_state = carry
-        index = jax.random.randint(key, (config.batch_size,), 0, rows.shape[0])
+        index = jax.random.randint(key, (config.batch_size,), 0, obs.shape[0])
 
         def loss(params):
             mean, _ = actor.apply(params, obs[index])
             return jnp.mean((jnp.tanh(mean[:, 0]) - wanted[index]) ** 2)
 
         error, grads = jax.value_and_grad(loss)(params)
-        updates, opt_state = optimizer.update(grads, opt_state)
+        updates, opt_state = _adam(config).update(grads, opt_state)
         return (optax.apply_updates(params, updates), opt_state), error
 
-    start = (params, optimizer.init(params))
-    (params, _), errors = jax.lax.scan(step, start, jax.random.split(key, config.updates))
-    return params, errors[-100:].mean()
+    (params, opt_state), errors = jax.lax.scan(step, (params, opt_state), keys)
+    return params, opt_state, errors

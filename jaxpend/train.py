@@ -11,6 +11,7 @@ import jax
 from . import cli, designs, sac, snes
 from .controllers.policy import Policy, load_policy
 from .errors import JaxpendError
+from .interrupt import Stopped, deferred, stop_if_asked
 from .runs import RunFolder
 from .sac import SACConfig
 from .score import nominal, official, score_v2
@@ -82,6 +83,7 @@ def train_sac(config: SACConfig, seed: int, folder: RunFolder) -> Policy:
         folder.log("sac", env_steps=0, updates=0, score=best_score)
         folder.save("sac_best.npz", best, stage="sac", env_steps=0, seed=seed)
         while int(state.env_steps) < config.steps:
+            stop_if_asked()
             state, metrics = sac.train_chunk(config, state, steps)
             policy = sac.greedy_policy(config, state)
             c = nominal(policy, policy.robot)
@@ -117,6 +119,7 @@ def train_snes(config: SNESConfig, start: Policy, seed: int, folder: RunFolder) 
     folder.save("snes_best.npz", best, stage="snes", generation=0, seed=seed)
     with LiveProgress("SNES", config.generations) as progress:
         while done < config.generations:
+            stop_if_asked()
             count = min(config.chunk, config.generations - done)
             state, metrics = snes.evolve(config, start, state, count)
             done += count
@@ -156,18 +159,19 @@ def train(config: Run, command: str = "jaxpend.train.train") -> dict:
     if policy is not None:
         result["start"] = official(policy, config.robot)
     try:
-        for name, stage in {"sac": train_sac, "snes": train_snes}.items():
-            if not hasattr(config, name):
-                continue
-            started = time.perf_counter()
-            before = () if name == "sac" else (policy,)
-            policy = stage(getattr(config, name), *before, config.seed, folder)
-            seconds = round(time.perf_counter() - started, 1)
-            result[name] = official(policy, config.robot) | {"seconds": seconds}
-            result["score"] = result[name]["score"]
-    except KeyboardInterrupt:
-        console.print(f"stopped; the best policies so far are in [bold]{folder.path}[/bold]")
-        raise
+        with deferred():
+            for name, stage in {"sac": train_sac, "snes": train_snes}.items():
+                if not hasattr(config, name):
+                    continue
+                started = time.perf_counter()
+                before = () if name == "sac" else (policy,)
+                policy = stage(getattr(config, name), *before, config.seed, folder)
+                seconds = round(time.perf_counter() - started, 1)
+                result[name] = official(policy, config.robot) | {"seconds": seconds}
+                result["score"] = result[name]["score"]
+    except Stopped as stop:
+        text = f"stopped; the best policies so far are in {folder.path}"
+        raise Stopped(stop.signum, text) from None
     folder.save("policy.npz", policy, seed=config.seed, score=result["score"])
     folder.write_json("result.json", result)
     return result

@@ -2,11 +2,13 @@
 
 import json
 import math
+import signal
 
 import numpy as np
 import pytest
 
 from jaxpend import JaxpendError, cli
+from jaxpend.interrupt import Stopped
 from jaxpend.train import TrainRun
 
 
@@ -17,6 +19,7 @@ from jaxpend.train import TrainRun
         (FileNotFoundError(2, "No such file", "a/b"), 2, "prog: cannot use a/b: No such file\n"),
         (OSError("odd"), 2, "prog: cannot use: odd\n"),
         (KeyboardInterrupt(), 130, "prog: interrupted\n"),
+        (Stopped(signal.SIGTERM, "stopped"), 143, "prog: stopped\n"),
     ],
 )
 def test_what_goes_wrong_is_one_sentence_and_an_exit_code(capsys, error, code, words):
