@@ -5,6 +5,7 @@ python experiments/leaderboard.py --controllers tvlqr    only these rows; the ot
 """
 
 import json
+from functools import partial
 from pathlib import Path
 
 from jaxpend import cli, designs, leaderboard
@@ -14,47 +15,54 @@ from jaxpend.files import write_atomically
 from jaxpend.terminal import console
 
 HERE = Path(__file__).parent
-# Those that need a policy file are judged by the experiments that make one.
-CLASSICAL = [name for name in KNOWN if not name.startswith("policy")]
 
 
-def kept(robot: str, names: list[str], path: Path) -> list[dict]:
-    """Rows of an earlier run that are not measured again."""
-    if not path.exists():
-        return []
-    rows = json.loads(path.read_text())[robot]["rows"]
-    return [r for r in rows if r["source"] == "measured" and r["name"] not in names]
+def merged(path: Path, robot: str, row: dict) -> dict:
+    """All boards of the file, with this row in place of an earlier measurement of it."""
+    boards = json.loads(path.read_text()) if path.exists() else {}
+    rows = boards.get(robot, {}).get("rows", [])
+    rows = [r for r in rows if r["source"] == "measured" and r["name"] != row["name"]]
+    rows = [*rows, row, *leaderboard.published(robot)]
+    boards[robot] = {"robot": robot, "rows": sorted(rows, key=lambda r: -r["score"])}
+    return boards
 
 
 def main(
-    controllers: str = ",".join(CLASSICAL), keys: int = 3, seed: int = 0, robustness: bool = True
+    controllers: str = ",".join(KNOWN),
+    robots: str = ",".join(designs.ROBOTS),
+    keys: int = 3,
+    seed: int = 0,
+    robustness: bool = True,
 ) -> None:
-    """Judge controllers on both boards.
+    """Judge controllers on both boards; every row is on disk as soon as it is measured.
 
     Args:
         controllers: names separated by commas.
-        keys: repetitions of what the benchmark draws; the table shows the first key.
+        robots: likewise.
+        keys: repetitions of what the benchmark draws; the table shows median and range.
         seed: of the first key.
         robustness: False measures performance only.
     """
     names = [choose("controller", name, KNOWN) for name in controllers.split(",")]
     path = HERE / "leaderboard.json"
-    boards, text = {}, ""
-    for robot in designs.ROBOTS:
-        chosen = {
-            name: (KNOWN[name].title, lambda plant, n=name, r=robot: build(n, plant, r))
-            for name in names
-        }
-        board = leaderboard.leaderboard(
-            robot, chosen, say=console.print, keys=keys, seed=seed, robustness=robustness
-        )
-        rows = board["rows"] + kept(robot, names, path)
-        board["rows"] = sorted(rows, key=lambda row: -row["score"])
-        boards[robot] = board
-        text += f"## {robot}\n\n{leaderboard.markdown(board)}\n"
-    cli.emit_json(boards, path)
     intro = "# Leaderboards v2: measured by `python experiments/leaderboard.py`, and published\n\n"
-    write_atomically(HERE / "leaderboard.md", intro + text.rstrip() + "\n")
+    for name in names:
+        for robot in (choose("robot", r, designs.ROBOTS) for r in robots.split(",")):
+            title = KNOWN[name].title
+            console.print(f"judging {title} of the {robot} ...")
+            row = {"name": name, "title": title, "source": "measured"}
+            row |= leaderboard.judge(
+                partial(build, name, robot=robot),
+                robot,
+                keys=keys,
+                seed=seed,
+                robustness=robustness,
+            )
+            boards = merged(path, robot, row)
+            cli.emit_json(boards, path)
+            tables = [(r, leaderboard.markdown(boards[r])) for r in designs.ROBOTS if r in boards]
+            text = "\n".join(f"## {r}\n\n{table}" for r, table in tables)
+            write_atomically(path.with_suffix(".md"), intro + text)
 
 
 if __name__ == "__main__":
