@@ -6,7 +6,6 @@ policy that imitates it learns to return from where noise leads (Laskey et al., 
 injection for robust imitation learning", 2017).
 """
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 
@@ -16,6 +15,7 @@ import numpy as np
 import optax
 
 from . import designs
+from .config import DemonstrationConfig
 from .controllers.base import Controller
 from .env import DoublePendulum
 from .errors import JaxpendError
@@ -27,32 +27,6 @@ __all__ = ["DemonstrationConfig", "collect", "imitate", "swingups"]
 
 SATURATED = 0.99  # of the torque limit
 CHUNK = 2000  # imitation updates in one compiled call
-
-
-@dataclasses.dataclass(frozen=True)
-class DemonstrationConfig:
-    """How demonstrations are made and imitated.
-
-    Each episode scales its noise by its own s^2, s uniform in [0, 1]; pulses are not scaled.
-    """
-
-    episodes: int = 0  # 0: no demonstrations, learn from the reward alone
-    duration: float = 4.0  # s an episode
-    action_noise: float = 0.3  # largest standard deviation, of the normalised action
-    kicks: float = 0.1  # rad/s, largest standard deviation of velocity jumps between steps
-    pulses: float = 0.0  # strength of disturbance pulses; 1 is the robustness benchmark's
-    start_spread: float = 0.1  # rad and rad/s, largest standard deviation of the initial state
-    updates: int = 20_000  # imitation updates of the actor before SAC
-    batch_size: int = 1024
-    learning_rate: float = 2e-3  # cosine decay to a thousandth
-    log_std: float = -2.5  # of the actor that SAC starts with, before the tanh
-
-    def __post_init__(self):
-        if self.episodes < 0:
-            raise JaxpendError(f"episodes is {self.episodes}; it must not be negative")
-        for name in ("duration", "updates", "batch_size", "learning_rate"):
-            if not getattr(self, name) > 0:
-                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
 
 
 def collect(

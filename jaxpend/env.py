@@ -7,72 +7,20 @@ a function of state and action. See ``networks.Actor`` for what the actor does w
 """
 
 import contextlib
-import dataclasses
 import io
-import math
 
 import jax
 import jax.numpy as jnp
 
 from . import designs
-from .errors import JaxpendError
-from .observation import Observation
+from .config import EnvConfig, Reward
 from .plant import forward_kinematics, kinetic_energy, potential_energy, rk4_step
 
 # MuJoCo, which Brax loads, prints what it lacks to standard output.
 with contextlib.redirect_stdout(io.StringIO()):
     from brax.envs.base import Env, State
 
-__all__ = ["LINES", "DoublePendulum", "EnvConfig", "Reward", "surrogate_reward"]
-
-# The paper's heights of the end effector above which the reward asks for balance, m.
-LINES = {"acrobot": 0.375, "pendubot": 0.35}
-
-
-@dataclasses.dataclass(frozen=True)
-class Reward:
-    """Coefficients of the surrogate reward; see ``surrogate_reward``."""
-
-    line: float | None = None  # m, height that separates the regimes; None: see ``LINES``
-    alpha: float = 2.0  # J, straight elbow above the line
-    beta: float = 1.0  # kinetic energy above the line
-    rho1: float = 0.1  # action squared, above the line
-    rho2: float = 0.02  # action squared, below
-    phi1: float = 0.15  # change of the action, above the line
-    phi2: float = 0.15  # change of the action, below
-    eta: float = 0.02  # s^2, joint velocities squared, below
-    floor: float = -math.inf  # a step earns at least this; a spinning arm earns -100 and less
-
-
-@dataclasses.dataclass(frozen=True)
-class EnvConfig:
-    """The learning environment. Raises ``JaxpendError`` for values that make no sense."""
-
-    robot: str = "pendubot"
-    torque_limit: float = 3.0  # N m, torque at action 1
-    dt: float = 0.01  # s, control period
-    duration: float = 10.0  # s, then the episode is truncated
-    observation: Observation = dataclasses.field(default_factory=Observation)
-    reward: Reward = dataclasses.field(default_factory=Reward)
-    max_speed: float = math.inf  # rad/s; SAC truncates an episode beyond it
-
-    def __post_init__(self):
-        designs.active_joint(self.robot)
-        if self.reward.line is None:
-            reward = dataclasses.replace(self.reward, line=LINES[self.robot])
-            object.__setattr__(self, "reward", reward)
-        for name in ("torque_limit", "dt", "duration", "max_speed"):
-            if not getattr(self, name) > 0:
-                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
-
-    @property
-    def episode_steps(self) -> int:
-        """Control steps in an episode."""
-        return round(self.duration / self.dt)
-
-    def make(self) -> "DoublePendulum":
-        """The environment."""
-        return DoublePendulum(self)
+__all__ = ["DoublePendulum", "EnvConfig", "Reward", "surrogate_reward"]
 
 
 def surrogate_reward(plant, reward: Reward, x, action, previous_action) -> jax.Array:

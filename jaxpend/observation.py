@@ -1,11 +1,14 @@
 """What a policy sees of the state. One definition for training, rollouts and policy files."""
 
-import dataclasses
+from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
+import dataclasses
+from typing import TYPE_CHECKING
 
 from .errors import JaxpendError, choose
+
+if TYPE_CHECKING:
+    import jax
 
 __all__ = ["KINDS", "Observation"]
 
@@ -15,12 +18,16 @@ def _wrapped(x: jax.Array, max_velocity: float) -> jax.Array:
 
     ``theta1 = pi`` maps to 0, but ``theta2 = 0``, the goal, lies on the wrap from 1 to -1.
     """
+    import jax.numpy as jnp  # here: a configuration loads without jax
+
     angles = (x[:2] % (2 * jnp.pi) - jnp.pi) / jnp.pi
     return jnp.concatenate([angles, jnp.clip(x[2:4] / max_velocity, -1.0, 1.0)])
 
 
 def _sincos(x: jax.Array, max_velocity: float) -> jax.Array:
     """Cosine and sine of both angles and scaled velocities: no jump anywhere."""
+    import jax.numpy as jnp
+
     angles, velocity = x[:2], x[2:4]
     return jnp.concatenate([jnp.cos(angles), jnp.sin(angles), velocity / max_velocity])
 

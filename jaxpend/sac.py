@@ -5,7 +5,6 @@ each followed by gradient updates. Episodes are truncated, never terminated: eve
 bootstraps from the true next state.
 """
 
-import dataclasses
 from functools import partial
 
 import jax
@@ -13,66 +12,13 @@ import jax.numpy as jnp
 import optax
 
 from ._struct import pytree
-from .controllers.policy import ACTIVATIONS, Policy
-from .demonstrations import DemonstrationConfig, imitate, swingups
-from .env import LINES, EnvConfig
-from .errors import JaxpendError, choose
+from .config import SACConfig
+from .controllers.policy import Policy
+from .demonstrations import imitate, swingups
+from .env import DoublePendulum
 from .networks import Actor, TwinCritic, constant_log_std, sample_action, to_policy
 
 __all__ = ["SACConfig", "SACState", "greedy_policy", "init", "train_chunk"]
-
-
-@dataclasses.dataclass(frozen=True)
-class SACConfig:
-    """Hyperparameters of SAC."""
-
-    env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
-    steps: int = 600_000  # environment steps, all environments together
-    num_envs: int = 32
-    updates_per_step: int = 4  # gradient updates per vector step (num_envs environment steps)
-    batch_size: int = 256
-    replay_capacity: int = 600_000  # transitions
-    warmup_steps: int = 5_000  # environment steps with uniform actions before learning
-    discount: float = 0.99
-    target_rate: float = 0.005  # Polyak averaging of the target critics
-    learning_rate: float = 1e-3
-    final_learning_rate: float = 1.0  # cosine decay to this fraction of learning_rate
-    target_entropy: float = -1.0  # nats
-    init_temperature: float = 0.1
-    reward_scale: float = 0.1
-    actor_hidden: tuple[int, ...] = (128, 128)
-    critic_hidden: tuple[int, ...] = (128, 128)
-    activation: str = "relu"
-    critic_layer_norm: bool = False
-    demonstrations: DemonstrationConfig = dataclasses.field(default_factory=DemonstrationConfig)
-    imitation: float = 0.0  # weight of the squared distance to the demonstrated actions
-    actor_delay: int = 0  # environment steps before the actor learns; the critics start at once
-    eval_every: int = 25_000  # environment steps between judgements by the official score
-
-    def __post_init__(self):
-        positive = (
-            "steps", "num_envs", "updates_per_step", "batch_size", "replay_capacity", "discount",
-            "target_rate", "learning_rate", "final_learning_rate", "init_temperature",
-            "reward_scale", "eval_every",
-        )  # fmt: skip
-        for name in positive:
-            if not getattr(self, name) > 0:
-                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
-        if self.discount >= 1:
-            raise JaxpendError(f"discount is {self.discount}; it must be below 1")
-        if self.replay_capacity < self.num_envs:
-            raise JaxpendError("replay_capacity must hold at least one step of all environments")
-        choose("activation", self.activation, ACTIVATIONS)
-
-    def for_robot(self, robot: str) -> "SACConfig":
-        """The same for another robot; the reward's line becomes that robot's, if not chosen."""
-        if robot == self.env.robot:
-            return self
-        reward = self.env.reward
-        if reward.line == LINES[self.env.robot]:
-            reward = dataclasses.replace(reward, line=None)
-        env = dataclasses.replace(self.env, robot=robot, reward=reward)
-        return dataclasses.replace(self, env=env)
 
 
 ROW = 4 + 1 + 1 + 1 + 4
@@ -133,7 +79,7 @@ def init(config: SACConfig, key: jax.Array) -> SACState:
     state, recipe = _fresh(config, key), config.demonstrations
     if not recipe.episodes:
         return state
-    env, (actor, _) = config.env.make(), networks(config)
+    env, (actor, _) = DoublePendulum(config.env), networks(config)
     rows, wanted = swingups(recipe, env, key_demonstrate, reward_scale=config.reward_scale)
     params = constant_log_std(state.actor, recipe.log_std)
     params, _ = imitate(recipe, actor, env.observe, params, rows, wanted, key_imitate)
@@ -143,7 +89,7 @@ def init(config: SACConfig, key: jax.Array) -> SACState:
 
 @partial(jax.jit, static_argnames="config")
 def _fresh(config: SACConfig, key: jax.Array) -> SACState:
-    env = config.env.make()
+    env = DoublePendulum(config.env)
     actor, critic = networks(config)
     key, key_actor, key_critic, key_env, key_time = jax.random.split(key, 5)
     obs, action = jnp.zeros(env.observation_size), jnp.zeros(1)
@@ -187,7 +133,7 @@ def update(config: SACConfig, state: SACState, batch: jax.Array, key: jax.Array)
     the target critics. The actor maximises the soft value under the critics, less the weighted
     distance to demonstrated actions.
     """
-    env, opt, (actor, critic_net) = config.env.make(), optimizer(config), networks(config)
+    env, opt, (actor, critic_net) = DoublePendulum(config.env), optimizer(config), networks(config)
     key_critic, key_actor = jax.random.split(key)
     x, previous, action, reward, next_x, wanted = jnp.split(batch, (4, 5, 6, 7, ROW), axis=1)
     observe = jax.vmap(env.observe)
@@ -238,7 +184,7 @@ def update(config: SACConfig, state: SACState, batch: jax.Array, key: jax.Array)
 
 def interact(config: SACConfig, state: SACState, key: jax.Array):
     """One step of every environment into the replay buffer; returns the mean reward too."""
-    env = config.env.make()
+    env = DoublePendulum(config.env)
     actor, _ = networks(config)
     key_action, key_uniform, key_reset = jax.random.split(key, 3)
     before = state.env_x
@@ -330,6 +276,7 @@ def greedy_policy(config: SACConfig, state: SACState) -> Policy:
 
 
 if __name__ == "__main__":
-    from .train import SACRun, command
+    from .config import SACRun
+    from .train import command
 
     command(SACRun, "jaxpend.sac", "SAC on the surrogate reward.")

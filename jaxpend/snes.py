@@ -7,7 +7,6 @@ rollouts whose greedy action is un-squashed, disturbed by Gaussian noise and squ
 generation meet the same noise: common random numbers make the comparison fair.
 """
 
-import dataclasses
 from functools import partial
 from typing import Any
 
@@ -18,42 +17,12 @@ from jax.flatten_util import ravel_pytree
 
 from . import designs
 from ._struct import pytree
+from .config import SNESConfig
 from .controllers.policy import Policy
-from .errors import JaxpendError, choose
 from .randomisation import LONGEST_DELAY, sample
 from .score import performance, score_v2
 
 __all__ = ["SNESConfig", "SNESState", "evolve", "fitness", "init"]
-
-SEARCHED = ("all", "hidden")
-
-
-@dataclasses.dataclass(frozen=True)
-class SNESConfig:
-    """Hyperparameters of the evolution strategy."""
-
-    generations: int = 400
-    population: int = 40
-    sigma: float = 0.01  # initial standard deviation of the parameters
-    final_sigma: float = 1.0  # sigma decays geometrically to this fraction of itself
-    searched: str = "all"  # "all" parameters, or "hidden": all but the output layer
-    rollouts: int = 1  # noisy rollouts per individual
-    action_noise: float = 0.1  # standard deviation before the tanh; 0 for none
-    scenarios: int = 0  # random imperfect scenarios a generation, the same for all individuals
-    scenario_weight: float = 0.5  # of their mean score in the fitness, where there are any
-    chunk: int = 10  # generations per report
-
-    def __post_init__(self):
-        choose("choice of searched parameters", self.searched, SEARCHED)
-        for name in ("generations", "population", "sigma", "final_sigma", "rollouts", "chunk"):
-            if not getattr(self, name) > 0:
-                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
-        if not self.action_noise >= 0:
-            raise JaxpendError(f"action_noise is {self.action_noise}; it must not be negative")
-        if self.scenarios < 0 or not 0 <= self.scenario_weight <= 1:
-            raise JaxpendError("scenarios must not be negative, scenario_weight lies in 0 to 1")
-        if self.population < 2:
-            raise JaxpendError("population is 1; SNES compares at least two individuals")
 
 
 @pytree
@@ -157,6 +126,7 @@ def best_policy(config: SNESConfig, policy: Policy, state: SNESState) -> Policy:
 
 
 if __name__ == "__main__":
-    from .train import SNESRun, command
+    from .config import SNESRun
+    from .train import command
 
     command(SNESRun, "jaxpend.snes", "SNES on the official score, from a policy file.")

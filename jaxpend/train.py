@@ -1,69 +1,21 @@
 """The whole job: SAC on the surrogate reward, then SNES on the official score, in a run folder."""
 
-import dataclasses
 import math
 import sys
 import time
-from pathlib import Path
 
 import jax
 
-from . import cli, designs, sac, snes
+from . import cli, sac, snes
+from .config import Run, SACConfig, SNESConfig, SNESRun, TrainRun
 from .controllers.policy import Policy, load_policy
 from .errors import JaxpendError
 from .interrupt import Stopped, deferred, stop_if_asked
 from .runs import RunFolder
-from .sac import SACConfig
 from .score import nominal, official, score_v2
-from .snes import SNESConfig
 from .terminal import LiveProgress, console, score_table
 
-__all__ = ["Run", "SACRun", "SNESRun", "TrainRun", "train", "train_sac", "train_snes"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """What every training run has. Raises ``JaxpendError`` for an unknown robot."""
-
-    robot: str = "pendubot"
-    seed: int = 0
-    run: str = ""  # name of the run folder; empty: ROBOT-seedSEED, or ROBOT-snes-seedSEED
-    runs: str = "runs"  # folder of the run folders
-
-    def __post_init__(self):
-        designs.active_joint(self.robot)
-        if hasattr(self, "sac"):
-            changed = self.sac.for_robot(self.robot)
-            object.__setattr__(self, "sac", changed)
-
-    @property
-    def folder(self) -> Path:
-        """Path of the run folder."""
-        # A stage alone must not land in the folder of the whole run that it may start from.
-        stage = {SACRun: "-sac", SNESRun: "-snes"}.get(type(self), "")
-        return Path(self.runs) / (self.run or f"{self.robot}{stage}-seed{self.seed}")
-
-
-@dataclasses.dataclass(frozen=True)
-class SACRun(Run):
-    """SAC alone."""
-
-    sac: SACConfig = dataclasses.field(default_factory=SACConfig)
-
-
-@dataclasses.dataclass(frozen=True)
-class SNESRun(Run):
-    """SNES alone, from a policy file."""
-
-    policy: str = ""  # where to start; empty: the policy that ships with the package
-    snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
-
-
-@dataclasses.dataclass(frozen=True)
-class TrainRun(SACRun):
-    """SAC, then SNES from its best policy."""
-
-    snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
+__all__ = ["execute", "train", "train_sac", "train_snes"]
 
 
 def train_sac(config: SACConfig, seed: int, folder: RunFolder) -> Policy:
@@ -177,14 +129,19 @@ def train(config: Run, command: str = "jaxpend.train.train") -> dict:
     return result
 
 
+def execute(config: Run, command: str) -> None:
+    """``train``, the score table, and where the results are."""
+    result = train(config, command)
+    stages = {"start": "start", "sac": "after SAC", "snes": "after SNES"}
+    score_table({stages[k]: result[k] for k in stages if k in result}, config.robot)
+    console.print(f"policy.npz, metrics and result are in [bold]{config.folder}[/bold]")
+
+
 def command(kind: type[Run], prog: str, description: str) -> None:
-    """A training command: configuration, run, score table, and where the results are."""
+    """A training command: configuration from the command line, then ``execute``."""
     with cli.guard(prog):
         config = cli.configure(kind(), prog, description, also=("policy", "sac", "snes"))
-        result = train(config, " ".join(["python -m", prog, *sys.argv[1:]]))
-        stages = {"start": "start", "sac": "after SAC", "snes": "after SNES"}
-        score_table({stages[k]: result[k] for k in stages if k in result}, config.robot)
-        console.print(f"policy.npz, metrics and result are in [bold]{config.folder}[/bold]")
+        execute(config, " ".join(["python -m", prog, *sys.argv[1:]]))
 
 
 if __name__ == "__main__":

@@ -58,11 +58,11 @@ def excerpt(name: str) -> dict[str, np.ndarray]:
 def imitation():
     """A policy that imitates the pendubot's swing-up, and the imitation that made it."""
     from jaxpend.demonstrations import DemonstrationConfig, imitate, swingups  # load brax
-    from jaxpend.env import EnvConfig
+    from jaxpend.env import DoublePendulum, EnvConfig
     from jaxpend.networks import Actor, to_policy
 
     config = DemonstrationConfig(episodes=150, updates=8000, batch_size=512)
-    env, actor = EnvConfig("pendubot").make(), Actor((64, 64), "tanh")
+    env, actor = DoublePendulum(EnvConfig("pendubot")), Actor((64, 64), "tanh")
     keys = jax.random.split(jax.random.key(0), 3)
     rows, wanted = swingups(config, env, keys[0], reward_scale=0.1)
     untrained = actor.init(keys[1], jax.numpy.zeros(env.observation_size))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxpend import JaxpendError, cli
+from jaxpend.config import TrainRun
 from jaxpend.interrupt import Stopped
-from jaxpend.train import TrainRun
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from conftest import assert_close
 from jaxpend import JaxpendError
 from jaxpend.controllers import Feedback, Zero
 from jaxpend.demonstrations import DemonstrationConfig, collect, swingups
-from jaxpend.env import EnvConfig
+from jaxpend.env import DoublePendulum, EnvConfig
 from jaxpend.networks import to_policy
 from jaxpend.sac import ROW, SACConfig, init
 from jaxpend.score import official
@@ -27,7 +27,7 @@ def parts(rows):
 
 @pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
 def test_rows_are_exact_transitions_under_noise(robot):
-    env = EnvConfig(robot).make()
+    env = DoublePendulum(EnvConfig(robot))
     law = Feedback(lambda t, x: jnp.full(2, 2.0) * jnp.cos(3 * x[0]))
     rows, wanted = collect(NOISY, env, law, jax.random.key(0), reward_scale=0.1)
     assert rows.shape == (400, ROW)
@@ -58,7 +58,9 @@ def test_rows_are_exact_transitions_under_noise(robot):
 def test_without_noise_every_episode_is_the_same():
     quiet = dataclasses.replace(NOISY, action_noise=0.0, kicks=0.0, start_spread=0.0)
     law = Feedback(lambda t, x: jnp.full(2, 2.0) * jnp.cos(3 * x[0]))
-    rows, wanted = collect(quiet, EnvConfig().make(), law, jax.random.key(0), reward_scale=1.0)
+    rows, wanted = collect(
+        quiet, DoublePendulum(EnvConfig()), law, jax.random.key(0), reward_scale=1.0
+    )
     _, _, action, _, _ = parts(rows)
     np.testing.assert_array_equal(action, wanted)
     for episode in np.split(np.asarray(rows), 4):
@@ -66,7 +68,7 @@ def test_without_noise_every_episode_is_the_same():
 
 
 def test_saturated_labels_are_left_out():
-    env = EnvConfig().make()
+    env = DoublePendulum(EnvConfig())
     law = Feedback(lambda t, x: jnp.where(t < 0.495, 1.5, 9.0) * jnp.ones(2))
     rows, wanted = collect(NOISY, env, law, jax.random.key(0), reward_scale=0.1)
     assert rows.shape == (4 * 50, ROW)
@@ -77,7 +79,9 @@ def test_saturated_labels_are_left_out():
 
 
 def test_a_controller_that_wants_nothing_is_labelled_so():
-    _, wanted = collect(NOISY, EnvConfig().make(), Zero(), jax.random.key(0), reward_scale=0.1)
+    _, wanted = collect(
+        NOISY, DoublePendulum(EnvConfig()), Zero(), jax.random.key(0), reward_scale=0.1
+    )
     assert not np.asarray(wanted).any()
 
 
@@ -108,7 +112,7 @@ def test_sac_starts_from_the_imitating_actor_and_its_demonstrations():
     untaught = init(alone, jax.random.key(0))
     assert untaught.demonstrations is None
     x, previous, action, reward, next_x = parts(state.demonstrations[:, :ROW])
-    expected, earned = jax.vmap(config.env.make().advance)(x, previous, action)
+    expected, earned = jax.vmap(DoublePendulum(config.env).advance)(x, previous, action)
     assert_close(next_x, expected, times=5)
     assert_close(reward, config.reward_scale * np.asarray(earned), times=5)
     assert state.demonstrations.shape == (len(x), ROW + 1)
@@ -120,7 +124,7 @@ def test_sac_starts_from_the_imitating_actor_and_its_demonstrations():
 def test_the_swing_up_is_that_of_the_robot():
     recipe = DemonstrationConfig(episodes=1, duration=4.0, action_noise=0, kicks=0, start_spread=0)
     for robot in ("acrobot", "pendubot"):
-        env = EnvConfig(robot).make()
+        env = DoublePendulum(EnvConfig(robot))
         rows, _ = swingups(recipe, env, jax.random.key(0), reward_scale=1.0)
         upright = np.cos(np.asarray(rows)[-50:, :2]) @ [[-1.0], [1.0]]
         np.testing.assert_allclose(upright, 2.0, atol=0.05)

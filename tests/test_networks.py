@@ -7,7 +7,7 @@ import pytest
 from conftest import assert_close, both_robots
 
 from jaxpend.designs import active_joint
-from jaxpend.env import EnvConfig
+from jaxpend.env import DoublePendulum, EnvConfig
 from jaxpend.networks import Actor, TwinCritic, constant_log_std, sample_action, to_policy
 from jaxpend.observation import Observation
 
@@ -124,7 +124,7 @@ def test_critics_are_two_and_see_everything(layer_norm):
 @pytest.mark.parametrize("kind", ["wrapped", "sincos"])
 def test_policy_acts_as_the_actors_mean(robot, activation, kind):
     env = EnvConfig(robot, torque_limit=2.5, dt=0.02, observation=Observation(kind))
-    observe = jax.vmap(env.make().observe)
+    observe = jax.vmap(DoublePendulum(env).observe)
     obs = observe(STATES, jnp.zeros(5))
     net = Actor((16, 8), activation)
     params = net.init(jax.random.key(0), obs)

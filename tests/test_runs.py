@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import pytest
 
 from jaxpend import JaxpendError, Policy, load_policy
+from jaxpend.config import SNESRun, TrainRun
 from jaxpend.controllers.policy import read_header
 from jaxpend.runs import RunFolder, from_mapping, load_config, to_mapping
-from jaxpend.train import SNESRun, TrainRun
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 

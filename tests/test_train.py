@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from jaxpend import Policy, cli, load_policy, save_policy, score
+from jaxpend.config import SACRun, SNESRun, TrainRun
 from jaxpend.controllers.policy import read_header
 from jaxpend.score import official
-from jaxpend.train import SACRun, SNESRun, TrainRun, command
+from jaxpend.train import command
 
 RECIPE = Path(__file__).parents[1] / "experiments" / "pendubot.yaml"
 CRITERIA = {

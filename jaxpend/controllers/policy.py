@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import config
 from .._struct import pytree, static
 from ..designs import ROBOTS, active_joint
 from ..errors import JaxpendError, choose
@@ -22,7 +23,7 @@ from ..observation import Observation
 __all__ = ["ACTIVATIONS", "Policy", "load_policy", "save_policy"]
 
 FORMAT = 1
-ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "silu": jax.nn.silu}
+ACTIVATIONS = {name: getattr(jax.nn, name) for name in config.ACTIVATIONS}
 
 
 @pytree

@@ -15,11 +15,10 @@ import numpy as np
 
 from ..errors import JaxpendError, choose
 from ..plant import Plant
+from ..robots import ROBOTS, active_joint
 
 __all__ = ["ROBOTS", "active_joint", "available", "competition", "from_dict", "from_file", "load"]
 
-# Driven joint of each robot.
-ROBOTS = {"acrobot": 1, "pendubot": 0}
 _REQUIRED = ("m1", "m2", "l1", "l2", "r1", "r2", "I1", "I2")
 _OPTIONAL = {
     "b1": 0.0, "b2": 0.0, "cf1": 0.0, "cf2": 0.0, "tl1": math.inf, "tl2": math.inf,
@@ -35,14 +34,6 @@ def _table() -> dict[str, dict[str, dict[str, float]]]:
 def available() -> list[str]:
     """The known parameter sets, as ``"C.1/1.0"``."""
     return [f"{design}/{model}" for design, models in _table().items() for model in models]
-
-
-def active_joint(robot: str) -> int:
-    """Index of the driven joint: 1 for the acrobot, 0 for the pendubot.
-
-    Raises ``JaxpendError`` for an unknown robot.
-    """
-    return ROBOTS[choose("robot", robot, ROBOTS)]
 
 
 def from_dict(

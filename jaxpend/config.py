@@ -1,0 +1,222 @@
+"""What can be configured: frozen plain dataclasses that load, and print their help, without jax."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+from .errors import JaxpendError, choose
+from .observation import Observation
+from .robots import active_joint
+
+__all__ = [
+    "DemonstrationConfig",
+    "EnvConfig",
+    "Reward",
+    "Run",
+    "SACConfig",
+    "SACRun",
+    "SNESConfig",
+    "SNESRun",
+    "TrainRun",
+]
+
+ACTIVATIONS = ("relu", "tanh", "silu")
+SEARCHED = ("all", "hidden")
+
+
+# The paper's heights of the end effector above which the reward asks for balance, m.
+LINES = {"acrobot": 0.375, "pendubot": 0.35}
+
+
+@dataclasses.dataclass(frozen=True)
+class Reward:
+    """Coefficients of the surrogate reward; see ``surrogate_reward``."""
+
+    line: float | None = None  # m, height that separates the regimes; None: see ``LINES``
+    alpha: float = 2.0  # J, straight elbow above the line
+    beta: float = 1.0  # kinetic energy above the line
+    rho1: float = 0.1  # action squared, above the line
+    rho2: float = 0.02  # action squared, below
+    phi1: float = 0.15  # change of the action, above the line
+    phi2: float = 0.15  # change of the action, below
+    eta: float = 0.02  # s^2, joint velocities squared, below
+    floor: float = -math.inf  # a step earns at least this; a spinning arm earns -100 and less
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvConfig:
+    """The learning environment. Raises ``JaxpendError`` for values that make no sense."""
+
+    robot: str = "pendubot"
+    torque_limit: float = 3.0  # N m, torque at action 1
+    dt: float = 0.01  # s, control period
+    duration: float = 10.0  # s, then the episode is truncated
+    observation: Observation = dataclasses.field(default_factory=Observation)
+    reward: Reward = dataclasses.field(default_factory=Reward)
+    max_speed: float = math.inf  # rad/s; SAC truncates an episode beyond it
+
+    def __post_init__(self):
+        active_joint(self.robot)
+        if self.reward.line is None:
+            reward = dataclasses.replace(self.reward, line=LINES[self.robot])
+            object.__setattr__(self, "reward", reward)
+        for name in ("torque_limit", "dt", "duration", "max_speed"):
+            if not getattr(self, name) > 0:
+                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
+
+    @property
+    def episode_steps(self) -> int:
+        """Control steps in an episode."""
+        return round(self.duration / self.dt)
+
+
+@dataclasses.dataclass(frozen=True)
+class DemonstrationConfig:
+    """How demonstrations are made and imitated.
+
+    Each episode scales its noise by its own s^2, s uniform in [0, 1]; pulses are not scaled.
+    """
+
+    episodes: int = 0  # 0: no demonstrations, learn from the reward alone
+    duration: float = 4.0  # s an episode
+    action_noise: float = 0.3  # largest standard deviation, of the normalised action
+    kicks: float = 0.1  # rad/s, largest standard deviation of velocity jumps between steps
+    pulses: float = 0.0  # strength of disturbance pulses; 1 is the robustness benchmark's
+    start_spread: float = 0.1  # rad and rad/s, largest standard deviation of the initial state
+    updates: int = 20_000  # imitation updates of the actor before SAC
+    batch_size: int = 1024
+    learning_rate: float = 2e-3  # cosine decay to a thousandth
+    log_std: float = -2.5  # of the actor that SAC starts with, before the tanh
+
+    def __post_init__(self):
+        if self.episodes < 0:
+            raise JaxpendError(f"episodes is {self.episodes}; it must not be negative")
+        for name in ("duration", "updates", "batch_size", "learning_rate"):
+            if not getattr(self, name) > 0:
+                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
+
+
+@dataclasses.dataclass(frozen=True)
+class SACConfig:
+    """Hyperparameters of SAC."""
+
+    env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
+    steps: int = 600_000  # environment steps, all environments together
+    num_envs: int = 32
+    updates_per_step: int = 4  # gradient updates per vector step (num_envs environment steps)
+    batch_size: int = 256
+    replay_capacity: int = 600_000  # transitions
+    warmup_steps: int = 5_000  # environment steps with uniform actions before learning
+    discount: float = 0.99
+    target_rate: float = 0.005  # Polyak averaging of the target critics
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 1.0  # cosine decay to this fraction of learning_rate
+    target_entropy: float = -1.0  # nats
+    init_temperature: float = 0.1
+    reward_scale: float = 0.1
+    actor_hidden: tuple[int, ...] = (128, 128)
+    critic_hidden: tuple[int, ...] = (128, 128)
+    activation: str = "relu"
+    critic_layer_norm: bool = False
+    demonstrations: DemonstrationConfig = dataclasses.field(default_factory=DemonstrationConfig)
+    imitation: float = 0.0  # weight of the squared distance to the demonstrated actions
+    actor_delay: int = 0  # environment steps before the actor learns; the critics start at once
+    eval_every: int = 25_000  # environment steps between judgements by the official score
+
+    def __post_init__(self):
+        positive = (
+            "steps", "num_envs", "updates_per_step", "batch_size", "replay_capacity", "discount",
+            "target_rate", "learning_rate", "final_learning_rate", "init_temperature",
+            "reward_scale", "eval_every",
+        )  # fmt: skip
+        for name in positive:
+            if not getattr(self, name) > 0:
+                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
+        if self.discount >= 1:
+            raise JaxpendError(f"discount is {self.discount}; it must be below 1")
+        if self.replay_capacity < self.num_envs:
+            raise JaxpendError("replay_capacity must hold at least one step of all environments")
+        choose("activation", self.activation, ACTIVATIONS)
+
+    def for_robot(self, robot: str) -> "SACConfig":
+        """The same for another robot; the reward's line becomes that robot's, if not chosen."""
+        if robot == self.env.robot:
+            return self
+        reward = self.env.reward
+        if reward.line == LINES[self.env.robot]:
+            reward = dataclasses.replace(reward, line=None)
+        env = dataclasses.replace(self.env, robot=robot, reward=reward)
+        return dataclasses.replace(self, env=env)
+
+
+@dataclasses.dataclass(frozen=True)
+class SNESConfig:
+    """Hyperparameters of the evolution strategy."""
+
+    generations: int = 400
+    population: int = 40
+    sigma: float = 0.01  # initial standard deviation of the parameters
+    final_sigma: float = 1.0  # sigma decays geometrically to this fraction of itself
+    searched: str = "all"  # "all" parameters, or "hidden": all but the output layer
+    rollouts: int = 1  # noisy rollouts per individual
+    action_noise: float = 0.1  # standard deviation before the tanh; 0 for none
+    scenarios: int = 0  # random imperfect scenarios a generation, the same for all individuals
+    scenario_weight: float = 0.5  # of their mean score in the fitness, where there are any
+    chunk: int = 10  # generations per report
+
+    def __post_init__(self):
+        choose("choice of searched parameters", self.searched, SEARCHED)
+        for name in ("generations", "population", "sigma", "final_sigma", "rollouts", "chunk"):
+            if not getattr(self, name) > 0:
+                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
+        if not self.action_noise >= 0:
+            raise JaxpendError(f"action_noise is {self.action_noise}; it must not be negative")
+        if self.scenarios < 0 or not 0 <= self.scenario_weight <= 1:
+            raise JaxpendError("scenarios must not be negative, scenario_weight lies in 0 to 1")
+        if self.population < 2:
+            raise JaxpendError("population is 1; SNES compares at least two individuals")
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What every training run has. Raises ``JaxpendError`` for an unknown robot."""
+
+    robot: str = "pendubot"
+    seed: int = 0
+    run: str = ""  # name of the run folder; empty: ROBOT-seedSEED, or ROBOT-snes-seedSEED
+    runs: str = "runs"  # folder of the run folders
+
+    def __post_init__(self):
+        active_joint(self.robot)
+        if hasattr(self, "sac"):
+            changed = self.sac.for_robot(self.robot)
+            object.__setattr__(self, "sac", changed)
+
+    @property
+    def folder(self) -> Path:
+        """Path of the run folder."""
+        # A stage alone must not land in the folder of the whole run that it may start from.
+        stage = {SACRun: "-sac", SNESRun: "-snes"}.get(type(self), "")
+        return Path(self.runs) / (self.run or f"{self.robot}{stage}-seed{self.seed}")
+
+
+@dataclasses.dataclass(frozen=True)
+class SACRun(Run):
+    """SAC alone."""
+
+    sac: SACConfig = dataclasses.field(default_factory=SACConfig)
+
+
+@dataclasses.dataclass(frozen=True)
+class SNESRun(Run):
+    """SNES alone, from a policy file."""
+
+    policy: str = ""  # where to start; empty: the policy that ships with the package
+    snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainRun(SACRun):
+    """SAC, then SNES from its best policy."""
+
+    snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
