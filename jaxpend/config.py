@@ -21,7 +21,6 @@ __all__ = [
 ]
 
 ACTIVATIONS = ("relu", "tanh", "silu")
-SEARCHED = ("all", "hidden")
 
 
 # The paper's heights of the end effector above which the reward asks for balance, m.
@@ -155,18 +154,19 @@ class SNESConfig:
 
     generations: int = 400
     population: int = 40
-    sigma: float = 0.01  # initial standard deviation of the parameters
+    sigma: float = 0.01  # initial standard deviation of a network's weights
+    gain_sigma: float = 0.05  # of the logarithm of all else: a fraction
     final_sigma: float = 1.0  # sigma decays geometrically to this fraction of itself
-    searched: str = "all"  # "all" parameters, or "hidden": all but the output layer
+    searched: str = "all"  # of what is declared; "hidden": no output layers; or "top,region.inner"
     rollouts: int = 1  # noisy rollouts per individual
-    action_noise: float = 0.1  # standard deviation before the tanh; 0 for none
+    action_noise: float = 0.1  # of policies, standard deviation before the tanh; 0 for none
     scenarios: int = 0  # random imperfect scenarios a generation, the same for all individuals
     scenario_weight: float = 0.5  # of their mean score in the fitness, where there are any
     chunk: int = 10  # generations per report
 
     def __post_init__(self):
-        choose("choice of searched parameters", self.searched, SEARCHED)
-        for name in ("generations", "population", "sigma", "final_sigma", "rollouts", "chunk"):
+        positive = ("generations", "population", "sigma", "gain_sigma", "final_sigma", "rollouts")
+        for name in (*positive, "chunk"):
             if not getattr(self, name) > 0:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
         if not self.action_noise >= 0:

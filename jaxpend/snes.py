@@ -1,8 +1,9 @@
-"""Separable natural evolution strategy on a policy's parameters against the official score.
+"""Separable natural evolution strategy on a controller's parameters against the official score.
 
 SNES (Wierstra et al., "Natural evolution strategies", JMLR 2014; evosax) starts from a trained
-policy. The fitness of an individual is its official v2 score (10 s at 500 Hz), averaged over
-rollouts whose greedy action is un-squashed, disturbed by Gaussian noise and squashed again
+policy, or from any other controller that declares what may be searched (``parameters.py``). The
+fitness of an individual is its official v2 score (10 s at 500 Hz), averaged over rollouts in
+which a policy's greedy action is un-squashed, disturbed by Gaussian noise and squashed again
 (Calì et al., 2024), so that what is found stands on wide ground. All individuals of a
 generation meet the same noise: common random numbers make the comparison fair.
 """
@@ -13,12 +14,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from evosax.algorithms import SNES
-from jax.flatten_util import ravel_pytree
 
 from . import designs
 from ._struct import pytree
 from .config import SNESConfig
+from .controllers.base import Controller
+from .controllers.parameters import coordinates
 from .controllers.policy import Policy
+from .errors import JaxpendError
 from .randomisation import LONGEST_DELAY, sample
 from .score import performance, score_v2
 
@@ -36,25 +39,32 @@ class SNESState:
     diverged: jax.Array  # () int, rollouts that were not finite, so far
 
 
-def split_parameters(config: SNESConfig, policy: Policy):
-    """The searched parameters as a flat vector, and the function that puts them back."""
-    kept = policy.layers[-1:] if config.searched == "hidden" else ()
-    searched = policy.layers[: len(policy.layers) - len(kept)]
-    flat, unravel = ravel_pytree(searched)
-    return flat, lambda vector: policy.replace(layers=(*unravel(vector), *kept))
+def _with_noise(controller: Controller, sigma: float) -> tuple[Controller, bool]:
+    """The controller with noise on the actions of its policies, and whether it has any."""
+    is_policy = lambda part: isinstance(part, Policy)  # noqa: E731
+    parts, structure = jax.tree.flatten(controller, is_leaf=is_policy)
+    noisy = [p.replace(action_noise=jnp.float32(sigma)) if is_policy(p) else p for p in parts]
+    if not sigma or not any(map(is_policy, parts)):
+        return controller, False
+    return jax.tree.unflatten(structure, noisy), True
 
 
-def fitness(config: SNESConfig, policy: Policy, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Fitness of a policy, to be maximised, and how many of its rollouts diverged.
+def fitness(
+    config: SNESConfig, controller: Controller, key: jax.Array, robot: str | None = None
+) -> tuple[jax.Array, jax.Array]:
+    """Fitness of a controller, to be maximised, and how many of its rollouts diverged.
 
     The mean v2 score over noisy nominal rollouts; with ``config.scenarios``, its weighted mean
-    with the mean v2 score over random imperfect scenarios (``randomisation.sample``).
+    with the mean v2 score over random imperfect scenarios (``randomisation.sample``). ``robot``
+    may be left out for a policy, which knows it; else a ``JaxpendError`` asks for it.
     """
-    plant = designs.competition(policy.robot)
+    robot = robot or getattr(controller, "robot", None)
+    if robot is None:
+        raise JaxpendError(f"{type(controller).__name__} does not know its robot; name it")
+    plant = designs.competition(robot)
     key_noise, key_scenario, key_run = jax.random.split(key, 3)
-    noise = jnp.asarray(config.action_noise, jnp.float32) if config.action_noise else None
-    noisy = policy.replace(action_noise=noise)
-    keys = jax.random.split(key_noise, config.rollouts if config.action_noise else 1)
+    noisy, draws = _with_noise(controller, config.action_noise)
+    keys = jax.random.split(key_noise, config.rollouts if draws else 1)
     c = jax.vmap(lambda k: performance(noisy, plant, k))(keys)
     # A diverged rollout has score 0 already; its velocity says that it diverged.
     score, diverged = score_v2(c).mean(), jnp.sum(~jnp.isfinite(c.velocity_cost))
@@ -63,40 +73,48 @@ def fitness(config: SNESConfig, policy: Policy, key: jax.Array) -> tuple[jax.Arr
     wrong = jax.vmap(lambda k: sample(plant, k))(jax.random.split(key_scenario, config.scenarios))
     keys = jax.random.split(key_run, config.scenarios)
     slots = LONGEST_DELAY + 1
-    c = jax.vmap(lambda s, k: performance(policy, s, k, delay_slots=slots))(wrong, keys)
+    c = jax.vmap(lambda s, k: performance(controller, s, k, delay_slots=slots))(wrong, keys)
     weight = config.scenario_weight
     score = (1 - weight) * score + weight * score_v2(c).mean()
     return score, diverged + jnp.sum(~jnp.isfinite(c.velocity_cost))
 
 
-def _strategy(config: SNESConfig, policy: Policy):
-    flat, rebuild = split_parameters(config, policy)
-    return SNES(population_size=config.population, solution=flat), flat, rebuild
+def _strategy(config: SNESConfig, controller: Controller):
+    flat, weights, rebuild = coordinates(controller, config.searched)
+    return SNES(population_size=config.population, solution=flat), flat, weights, rebuild
 
 
-def init(config: SNESConfig, policy: Policy, key: jax.Array) -> SNESState:
-    """Search distribution centred on the policy."""
-    strategy, flat, _ = _strategy(config, policy)
+def init(config: SNESConfig, controller: Controller, key: jax.Array) -> SNESState:
+    """Search distribution centred on the controller. Raises as ``parameters.kinds``."""
+    strategy, flat, weights, _ = _strategy(config, controller)
     key, key_init = jax.random.split(key)
-    params = strategy.default_params.replace(std_init=jnp.asarray(config.sigma, flat.dtype))
-    state = strategy.init(key_init, flat, params)
+    std = jnp.where(weights, config.sigma, config.gain_sigma).astype(flat.dtype)
+    state = strategy.init(key_init, flat, strategy.default_params.replace(std_init=std))
     return SNESState(state, key, flat, jnp.asarray(-jnp.inf), jnp.zeros((), jnp.int32))
 
 
-@partial(jax.jit, static_argnames=("config", "generations"))
-def evolve(config: SNESConfig, policy: Policy, state: SNESState, generations: int):
+@partial(jax.jit, static_argnames=("config", "generations", "robot"))
+def evolve(
+    config: SNESConfig,
+    start: Controller,
+    state: SNESState,
+    generations: int,
+    robot: str | None = None,
+):
     """Run some generations; returns the state and per-generation metrics (generations,).
 
-    ``policy`` gives the parameters that are not searched, and the form of those that are.
+    ``start`` is what ``init`` got: the origin of the coordinates, and all that is not searched.
+    ``robot`` is as in ``fitness``.
     """
-    strategy, _, rebuild = _strategy(config, policy)
+    strategy, *_, rebuild = _strategy(config, start)
     params = strategy.default_params
     decay = config.final_sigma ** (1.0 / config.generations)
 
     def generation(state, _):
         key, key_ask, key_noise, key_tell = jax.random.split(state.key, 4)
         population, inner = strategy.ask(key_ask, state.strategy, params)
-        scores, diverged = jax.vmap(lambda p: fitness(config, rebuild(p), key_noise))(population)
+        judge = lambda p: fitness(config, rebuild(p), key_noise, robot)  # noqa: E731
+        scores, diverged = jax.vmap(judge)(population)
         # The one place that negates: evosax minimises.
         inner, _ = strategy.tell(key_tell, population, -scores, inner, params)
         inner = inner.replace(std=inner.std * decay)
@@ -115,18 +133,18 @@ def evolve(config: SNESConfig, policy: Policy, state: SNESState, generations: in
     return jax.lax.scan(generation, state, length=generations)
 
 
-def mean_policy(config: SNESConfig, policy: Policy, state: SNESState) -> Policy:
-    """The policy at the centre of the search distribution."""
-    return split_parameters(config, policy)[1](state.strategy.mean)
+def mean_controller(config: SNESConfig, start: Controller, state: SNESState) -> Controller:
+    """The controller at the centre of the search distribution."""
+    return coordinates(start, config.searched)[-1](state.strategy.mean)
 
 
-def best_policy(config: SNESConfig, policy: Policy, state: SNESState) -> Policy:
+def best_controller(config: SNESConfig, start: Controller, state: SNESState) -> Controller:
     """The individual with the best noisy fitness so far."""
-    return split_parameters(config, policy)[1](state.best)
+    return coordinates(start, config.searched)[-1](state.best)
 
 
 if __name__ == "__main__":
     from .config import SNESRun
     from .train import command
 
-    command(SNESRun, "jaxpend.snes", "SNES on the official score, from a policy file.")
+    command(SNESRun, "jaxpend.snes", "SNES on the official score, from any controller.")

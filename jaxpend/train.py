@@ -78,8 +78,8 @@ def train_snes(config: SNESConfig, start: Policy, seed: int, folder: RunFolder) 
             key_fresh, key_now = jax.random.split(key_fresh)
             row = {name: values[-1] for name, values in metrics.items()}
             candidates = {
-                "mean": snes.mean_policy(config, start, state),
-                "individual": snes.best_policy(config, start, state),
+                "mean": snes.mean_controller(config, start, state),
+                "individual": snes.best_controller(config, start, state),
             }
             for name, policy in candidates.items():
                 score = float(score_v2(nominal(policy, policy.robot)))

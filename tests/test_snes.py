@@ -9,6 +9,8 @@ import pytest
 from conftest import assert_close
 
 from jaxpend import JaxpendError, Policy, designs, snes
+from jaxpend.controllers import load_nominal, lqr, tvlqr
+from jaxpend.controllers.known import with_lqr
 from jaxpend.score import official, performance, score_v2
 from jaxpend.snes import SNESConfig
 
@@ -28,7 +30,7 @@ def distance(policy):
 def toy_fitness(monkeypatch):
     """A fitness that is largest where every parameter is 0.1, with one noise a generation."""
 
-    def fitness(config, policy, key):
+    def fitness(config, policy, key, robot):
         return jax.random.normal(key) - distance(policy), jnp.zeros((), jnp.int32)
 
     monkeypatch.setattr(snes, "fitness", fitness)
@@ -45,7 +47,7 @@ def evolved(config, policy, generations):
 def test_the_search_climbs_the_fitness(toy_fitness):
     config = SNESConfig(generations=40, population=20, sigma=0.03)
     state, _ = evolved(config, TOY, 40)
-    found = snes.mean_policy(config, TOY, state)
+    found = snes.mean_controller(config, TOY, state)
     assert distance(found) < 0.2 * distance(TOY)
     assert np.mean(np.asarray(found.layers[0][0])) > 0.05
 
@@ -58,7 +60,7 @@ def test_best_individual_is_the_one_with_the_best_fitness_so_far(toy_fitness):
         assert row["max_fitness"] >= row["mean_fitness"]
         metrics.append(float(row["max_fitness"][0]))
         assert_close(state.best_fitness, max(metrics))
-    best = snes.best_policy(config, TOY, state)
+    best = snes.best_controller(config, TOY, state)
     # The noise is one number a generation, the rest is the distance.
     offset = [float(state.best_fitness + distance(best)), *metrics]
     assert np.isfinite(offset).all()
@@ -69,7 +71,8 @@ def test_only_what_is_searched_changes(toy_fitness):
     for searched in ("all", "hidden"):
         config = SNESConfig(generations=3, population=4, searched=searched)
         state, _ = evolved(config, TOY, 3)
-        for found in (snes.mean_policy(config, TOY, state), snes.best_policy(config, TOY, state)):
+        for centre in (snes.mean_controller, snes.best_controller):
+            found = centre(config, TOY, state)
             assert jax.tree.structure(found) == jax.tree.structure(TOY)
             assert np.all(np.asarray(found.layers[0][0]) != 0)
             assert np.all(np.asarray(found.layers[0][1]) != 0)
@@ -77,8 +80,31 @@ def test_only_what_is_searched_changes(toy_fitness):
             assert changed == [searched == "all"] * 2
 
 
+def test_gains_are_searched_in_units_of_themselves(monkeypatch):
+    """The optimum is 20 % above every gain; weights and gains start with a sigma of their own."""
+    start = with_lqr(TOY, designs.competition("pendubot"), "pendubot")
+
+    def fitness(config, found, key, robot):
+        assert robot == "pendubot"
+        ratio = found.top.gain[0] / (1.2 * start.top.gain[0])
+        return -jnp.sum(jnp.log(ratio) ** 2), jnp.zeros((), jnp.int32)
+
+    monkeypatch.setattr(snes, "fitness", fitness)
+    snes.evolve.clear_cache()
+    config = SNESConfig(generations=30, population=20, sigma=0.02, gain_sigma=0.05)
+    state = snes.init(config, start, KEY)
+    assert_close(state.strategy.std, np.repeat([0.02, 0.05], [25, 10]))
+    state, _ = snes.evolve(config, start, state, 30, "pendubot")
+    snes.evolve.clear_cache()
+    for centre in (snes.mean_controller, snes.best_controller):
+        found = centre(config, start, state)
+        assert jax.tree.structure(found) == jax.tree.structure(start)
+        np.testing.assert_allclose(found.top.gain[0] / start.top.gain[0], 1.2, atol=0.06)
+        np.testing.assert_array_equal(found.top.gain[1], 0.0)
+
+
 def test_sigma_decays_to_its_final_fraction(monkeypatch):
-    flat = lambda config, policy, key: (jnp.zeros(()), jnp.zeros((), jnp.int32))  # noqa: E731
+    flat = lambda config, policy, key, robot: (jnp.zeros(()), jnp.zeros((), jnp.int32))  # noqa: E731
     monkeypatch.setattr(snes, "fitness", flat)
     sigmas = {}
     for final in (1.0, 0.25):
@@ -92,7 +118,7 @@ def test_sigma_decays_to_its_final_fraction(monkeypatch):
 
 
 def test_an_individual_that_is_nan_is_last_and_counted_and_poisons_nothing(monkeypatch):
-    def fitness(config, policy, key):
+    def fitness(config, policy, key, robot):
         sick = policy.layers[0][1][0] > 0
         kernel = jnp.where(sick, jnp.nan, policy.layers[0][0])
         layers = ((kernel, policy.layers[0][1]), policy.layers[1])
@@ -111,7 +137,7 @@ def test_an_individual_that_is_nan_is_last_and_counted_and_poisons_nothing(monke
     assert np.isfinite(state.best_fitness)
     assert np.all(metrics["mean_fitness"] > 0)
     # The search walks away from where individuals are lost.
-    assert snes.mean_policy(config, TOY, state).layers[0][1][0] < 0
+    assert snes.mean_controller(config, TOY, state).layers[0][1][0] < 0
 
 
 def lost(policy):
@@ -122,7 +148,7 @@ def lost(policy):
 @pytest.fixture(scope="module")
 def fit():
     """``snes.fitness``, jitted."""
-    return jax.jit(snes.fitness, static_argnums=0)
+    return jax.jit(snes.fitness, static_argnums=(0, 3))
 
 
 QUIET = SNESConfig(action_noise=0.0, rollouts=3)
@@ -150,6 +176,25 @@ def test_fitness_is_the_mean_over_rollouts_with_noisy_actions(imitation, fit):
     assert (float(score), int(diverged)) == (0.0, 2)
 
 
+def test_any_controller_has_a_fitness_and_only_policies_have_action_noise(imitation, fit):
+    plant = designs.competition("pendubot")
+    holding = lqr(plant, "pendubot")
+    with pytest.raises(JaxpendError, match="LQR does not know its robot"):
+        snes.fitness(QUIET, holding, KEY)
+    noisy = SNESConfig(action_noise=0.3, rollouts=2)
+    hybrid = with_lqr(imitation.policy, plant, "pendubot")
+    quiet, _ = fit(QUIET, hybrid, KEY, "pendubot")
+    np.testing.assert_allclose(quiet, official(hybrid, "pendubot")["score"], atol=2e-3)
+    assert 0 < fit(noisy, hybrid, KEY, "pendubot")[0] < quiet - 0.01
+    # No policy, no noise: one rollout, that counts once if it is lost.
+    tracking = tvlqr(plant, load_nominal("pendubot"))
+    score, diverged = fit(noisy, tracking, KEY, "pendubot")
+    np.testing.assert_allclose(score, official(tracking, "pendubot")["score"], atol=2e-3)
+    sick = tracking.replace(gain=tracking.gain * jnp.nan)
+    score, diverged = fit(noisy, sick, KEY, "pendubot")
+    assert (float(score), int(diverged)) == (0.0, 1)
+
+
 def test_a_generation_meets_one_noise_and_improves_the_policy(imitation, fit):
     *hidden, (kernel, bias) = imitation.policy.layers
     off = imitation.policy.replace(layers=(*hidden, (kernel, bias + 0.05)))
@@ -162,7 +207,7 @@ def test_a_generation_meets_one_noise_and_improves_the_policy(imitation, fit):
     state, metrics = evolved(dataclasses.replace(config, generations=25, sigma=0.005), off, 25)
     means = np.asarray(metrics["mean_fitness"])
     assert means[-3:].mean() > means[:3].mean() + 0.003
-    found = snes.mean_policy(config, off, state)
+    found = snes.mean_controller(config, off, state)
     assert fit(QUIET, found, KEY)[0] > fit(QUIET, off, KEY)[0]
     assert state.diverged == 0
 
@@ -175,7 +220,7 @@ def test_a_generation_meets_one_noise_and_improves_the_policy(imitation, fit):
         ({"sigma": 0.0}, "sigma is 0.0; it must be positive"),
         ({"action_noise": -0.1}, "action_noise is -0.1; it must not be negative"),
         ({"action_noise": float("nan")}, "action_noise is nan; it must not be negative"),
-        ({"searched": "some"}, "unknown choice of searched parameters 'some'; known: all, hidden"),
+        ({"gain_sigma": 0.0}, "gain_sigma is 0.0; it must be positive"),
         ({"scenarios": -1}, "scenarios must not be negative"),
         ({"scenario_weight": 1.5}, "scenario_weight lies in 0 to 1"),
     ],

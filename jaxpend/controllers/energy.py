@@ -13,6 +13,8 @@ Source: Spong, "The swing up control problem for the acrobot", 1995, and Fantoni
 catches it there.
 """
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +24,7 @@ from ..designs import active_joint
 from ..plant import Plant, dynamics, mass_matrix, total_energy
 from .base import Memoryless
 from .lqr import deviation
+from .parameters import FACTOR
 
 __all__ = ["EnergyShaping", "energy_shaping"]
 
@@ -36,6 +39,7 @@ GAINS = {
 class EnergyShaping(Memoryless):
     """Pumps the total energy to that of upright; needs the plant, as a model."""
 
+    SEARCHED: ClassVar = dict.fromkeys(("kp", "kd", "ke", "cap", "kick"), FACTOR)
     plant: Plant
     kp: jax.Array  # () 1/s^2
     kd: jax.Array  # () 1/s

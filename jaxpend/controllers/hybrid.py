@@ -1,12 +1,13 @@
 """Two controllers and a region: one swings up, the other holds the top; hysteresis between them."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from .._struct import pytree
 from .lqr import LQR, deviation
+from .parameters import FACTOR
 
 __all__ = ["Ellipsoid", "Hybrid", "Tolerances", "ellipsoid", "ellipsoid_of_torque"]
 
@@ -15,6 +16,7 @@ __all__ = ["Ellipsoid", "Hybrid", "Tolerances", "ellipsoid", "ellipsoid_of_torqu
 class Ellipsoid:
     """Entered where ``e' P e <= inner``, left where it exceeds ``outer``."""
 
+    SEARCHED: ClassVar = {"inner": FACTOR, "outer": FACTOR}
     matrix: jax.Array  # (4, 4) P
     goal: jax.Array  # (4,)
     inner: jax.Array  # ()
@@ -30,6 +32,7 @@ class Ellipsoid:
 class Tolerances:
     """Entered where ``|e| <= inner`` in every component, left where one exceeds ``outer``."""
 
+    SEARCHED: ClassVar = {"inner": FACTOR, "outer": FACTOR}
     goal: jax.Array  # (4,)
     inner: jax.Array  # (4,) rad, rad, rad/s, rad/s
     outer: jax.Array  # (4,)

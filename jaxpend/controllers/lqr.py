@@ -6,6 +6,8 @@ with ``A, B`` the linearisation at ``x* = (pi, 0, 0, 0)``. The cost-to-go ``V = 
 region: the ellipsoid ``V <= level``. Angles are compared modulo one turn.
 """
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,7 @@ from ..designs import active_joint
 from ..errors import JaxpendError
 from ..plant import Plant, linearize
 from .base import Memoryless
+from .parameters import FACTOR
 
 __all__ = ["LQR", "deviation", "lqr"]
 
@@ -33,6 +36,8 @@ def deviation(x: jax.Array, goal: jax.Array) -> jax.Array:
 @pytree
 class LQR(Memoryless):
     """State feedback around a fixed point, clipped to the torque limit."""
+
+    SEARCHED: ClassVar = {"gain": FACTOR}
 
     gain: jax.Array  # (2, 4) N m per state unit; the passive joint's row is zero
     cost_to_go: jax.Array  # (4, 4) P of V = e' P e

@@ -11,7 +11,7 @@ the horizon ends, so that a short horizon is enough), or upright itself (it flie
 """
 
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from ..plant import Plant
 from ..swingup import step
 from .lqr import DEFAULT_Q, deviation, lqr
 from .nominal import Nominal
+from .parameters import FACTOR
 from .tvlqr import along
 
 __all__ = ["MPC", "free_mpc", "tracking_mpc"]
@@ -68,6 +69,7 @@ PROBLEM = Problem(step=step, features=_features, final=_final, outer=lambda p, s
 class MPC:
     """iLQR over a receding horizon of H steps. Its memory is the plan."""
 
+    SEARCHED: ClassVar = {"q": FACTOR, "r": FACTOR, "smoothness": FACTOR}
     plant: Plant  # the model it predicts with
     x_ref: jax.Array  # (N + 1, 4) reference; past its end, its last state
     u_ref: jax.Array  # (N,)

@@ -1,5 +1,7 @@
 """Proportional-derivative control of the driven joint: the simplest reference."""
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 
@@ -8,6 +10,7 @@ from ..designs import active_joint
 from ..plant import Plant
 from .base import Memoryless
 from .lqr import deviation
+from .parameters import FACTOR
 
 __all__ = ["PD", "pd"]
 
@@ -16,6 +19,7 @@ __all__ = ["PD", "pd"]
 class PD(Memoryless):
     """``-kp (theta - target) - kd omega`` on every joint whose gains are not zero."""
 
+    SEARCHED: ClassVar = {"proportional": FACTOR, "derivative": FACTOR}
     target: jax.Array  # (2,) rad; compared modulo one turn
     proportional: jax.Array  # (2,) N m/rad
     derivative: jax.Array  # (2,) N m s/rad

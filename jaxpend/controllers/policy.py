@@ -7,7 +7,7 @@ import json
 import zipfile
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from ..designs import ROBOTS, active_joint
 from ..errors import JaxpendError, choose
 from ..files import write_atomically
 from ..observation import Observation
+from .parameters import WEIGHT
 
 __all__ = ["ACTIVATIONS", "Policy", "load_policy", "save_policy"]
 
@@ -34,6 +35,7 @@ class Policy:
     (SNES trains with it); None means greedy and costs nothing.
     """
 
+    SEARCHED: ClassVar = {"layers": WEIGHT}
     layers: tuple[tuple[jax.Array, jax.Array], ...]  # (kernel (in, out), bias (out,)) each
     torque_limit: jax.Array  # () N m, torque at action 1
     action_noise: jax.Array | None = None  # ()

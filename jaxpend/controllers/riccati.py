@@ -6,6 +6,8 @@ The gains are those of the optimised cost itself, so they correct only as far as
 by it: the feedback includes the last torque, because a change of torque costs smoothness.
 """
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 
@@ -13,6 +15,7 @@ from .._struct import pytree
 from ..plant import Plant
 from .lqr import DEFAULT_Q, DEFAULT_R, LQR, deviation, lqr
 from .nominal import Nominal
+from .parameters import OVER_TIME
 
 __all__ = ["Riccati", "riccati"]
 
@@ -21,6 +24,7 @@ __all__ = ["Riccati", "riccati"]
 class Riccati:
     """Feed-forward and iLQR gains along a trajectory, then the LQR at its end."""
 
+    SEARCHED: ClassVar = {"nominal.gain": OVER_TIME}
     nominal: Nominal
     top: LQR
 

@@ -7,6 +7,8 @@ with ``A, B`` the derivatives of one integration step along the trajectory (Tedr
 "Underactuated robotics", chapter 8).
 """
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,7 @@ from ..plant import Plant, rk4_step
 from .base import Memoryless
 from .lqr import DEFAULT_Q, DEFAULT_R, LQR, deviation, lqr
 from .nominal import Nominal
+from .parameters import OVER_TIME
 
 __all__ = ["TVLQR", "along", "tvlqr"]
 
@@ -24,6 +27,7 @@ __all__ = ["TVLQR", "along", "tvlqr"]
 class TVLQR(Memoryless):
     """Feed-forward and time-varying gains along a trajectory, then the LQR at its end."""
 
+    SEARCHED: ClassVar = {"gain": OVER_TIME}
     nominal: Nominal
     gain: jax.Array  # (N, 4) N m per state unit, of the driven joint
     top: LQR
