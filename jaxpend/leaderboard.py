@@ -13,9 +13,9 @@ import jax
 
 from . import cli, designs
 from .boards import HEADINGS, PUBLISHED
-from .controllers.base import Controller
 from .controllers.known import KNOWN, build
 from .controllers.policy import load_policy
+from .controllers.saved import load_controller
 from .errors import JaxpendError, choose
 from .files import write_atomically
 from .robustness import CRITERIA, benchmark
@@ -161,8 +161,8 @@ def _chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[st
         for name in names
     }
     if policy is not None:
-        own: Controller = load_policy(policy, robot=robot)
-        chosen["own_policy"] = (policy.stem, lambda plant: own)
+        load_controller(policy, robot=robot)  # a wrong file is known at once
+        chosen["own_policy"] = (policy.stem, lambda plant: load_controller(policy, robot=robot))
     return chosen
 
 
@@ -181,7 +181,7 @@ def main(
     Args:
         robot: acrobot or pendubot.
         controllers: names separated by commas; by default all that are known.
-        policy: a policy file to judge as well.
+        policy: a policy or controller file to judge as well.
         robustness: False leaves the robustness benchmark out (minutes for MPC).
         keys: repetitions of what the benchmark draws at random.
         seed: of the benchmark's first key.

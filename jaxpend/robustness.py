@@ -269,9 +269,9 @@ def _report(grids, outcomes, keys, compile_seconds, run_seconds) -> Report:
 def _controller(policy: str | None, controller: str | None, robot: str) -> Controller:
     """The policy, or what ``module:name`` names: a controller, or a Python function."""
     if controller is None:
-        from .controllers.policy import load_policy
+        from .controllers.saved import load_controller
 
-        return load_policy(policy or robot, robot=robot)
+        return load_controller(policy or robot, robot=robot)
     if policy is not None:
         raise JaxpendError("give either a policy or a controller, not both")
     import importlib
@@ -341,7 +341,7 @@ def main(
 
     Args:
         robot: acrobot or pendubot.
-        policy: a policy file; by default the one that ships with the package.
+        policy: a policy or controller file; by default the policy that ships with the package.
         controller: judge this instead: module:name of a jaxpend controller, or of a Python
             function (t, x) -> torque, which takes minutes (see jaxpend.controllers.python).
         torque_limit: of the driven joint, N m; 6 on the boards.

@@ -175,19 +175,21 @@ def score_v3(c: Criteria, t_final: float = 60.0) -> jax.Array:
 
 
 def main(robot: str = "pendubot", policy: str | None = None, json: str | None = None) -> None:
-    """Official v2 score of a policy, in float64.
+    """Official v2 score of a policy or any other saved controller, in float64.
 
     Args:
         robot: acrobot or pendubot.
-        policy: a policy file; by default the one that ships with the package.
+        policy: a policy or controller file; by default the policy that ships with the package.
         json: write the result as JSON to this file, or "-" for standard output.
     """
     from . import cli
-    from .controllers.policy import load_policy, read_header
+    from .controllers.policy import read_header
+    from .controllers.saved import load_controller
     from .terminal import score_table
 
     active_joint(robot)
-    loaded = load_policy(policy or robot, robot=robot)
+    with jax.enable_x64(True):
+        loaded = load_controller(policy or robot, robot=robot)
     header = read_header(policy or robot)
     result = official(loaded, robot) | {"policy": policy or robot, "header": header}
     if json != "-":

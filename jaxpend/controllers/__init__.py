@@ -9,6 +9,7 @@ from .nominal import Nominal, load_nominal, save_nominal
 from .pd import PD, pd
 from .policy import Policy, load_policy, save_policy
 from .riccati import Riccati, riccati
+from .saved import load_controller, save_controller
 from .tvlqr import TVLQR, tvlqr
 
 __all__ = [
@@ -31,11 +32,13 @@ __all__ = [
     "ellipsoid_of_torque",
     "energy_shaping",
     "free_mpc",
+    "load_controller",
     "load_nominal",
     "load_policy",
     "lqr",
     "pd",
     "riccati",
+    "save_controller",
     "save_nominal",
     "save_policy",
     "tracking_mpc",

@@ -1,8 +1,5 @@
 """An optimised swing-up to follow, and its file: plain arrays and a JSON header."""
 
-import io
-import json
-import zipfile
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -12,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._struct import pytree, static
+from ..arrays import read_arrays, write_arrays
 from ..designs import ROBOTS, active_joint
 from ..errors import JaxpendError, choose
-from ..files import write_atomically
 
 __all__ = ["Nominal", "load_nominal", "read_nominal_header", "save_nominal"]
 
@@ -62,15 +59,8 @@ def save_nominal(path: str | Path, nominal: Nominal, provenance: dict[str, Any])
         "dt": nominal.dt,
         "provenance": provenance,
     }
-    buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        header=np.array(json.dumps(header)),
-        x=np.asarray(nominal.x, "f4"),
-        u=np.asarray(nominal.u, "f8"),
-        gain=np.asarray(nominal.gain, "f4"),
-    )
-    write_atomically(path, buffer.getvalue())
+    arrays = {"x": np.asarray(nominal.x, "f4"), "gain": np.asarray(nominal.gain, "f4")}
+    write_arrays(path, header, arrays | {"u": np.asarray(nominal.u, "f8")})
 
 
 def _locate(robot_or_path: str | Path) -> Path:
@@ -80,15 +70,7 @@ def _locate(robot_or_path: str | Path) -> Path:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    try:
-        # Read whole first: numpy leaves a broken file open.
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            arrays = dict(file)
-        header = json.loads(str(arrays.pop("header")))
-    except FileNotFoundError:
-        raise JaxpendError(f"there is no trajectory file {path}") from None
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
-        raise JaxpendError(f"{path} is not a trajectory file, or it is empty or cut off") from None
+    header, arrays = read_arrays(path, "trajectory")
     if header.get("kind") != "swing-up" or header.get("format") != FORMAT:
         raise JaxpendError(f"{path} is not a swing-up trajectory of format {FORMAT}")
     return header, arrays

@@ -1,10 +1,7 @@
 """A neural network policy as a controller, and its file: plain arrays and a JSON header."""
 
 import dataclasses
-import io
 import itertools
-import json
-import zipfile
 from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,9 +12,9 @@ import numpy as np
 
 from .. import config
 from .._struct import pytree, static
+from ..arrays import read_arrays, write_arrays
 from ..designs import ROBOTS, active_joint
 from ..errors import JaxpendError, choose
-from ..files import write_atomically
 from ..observation import Observation
 from .parameters import WEIGHT
 
@@ -85,32 +82,24 @@ def save_policy(path: str | Path, policy: Policy, provenance: dict[str, Any] | N
 
     ``provenance`` is any JSON object: command, seed, scores, ...
     """
-    arrays = {"header": np.array(json.dumps(_header(policy, provenance or {})))}
+    arrays = {}
     for i, (kernel, bias) in enumerate(policy.layers):
         arrays |= {f"kernel{i}": np.asarray(kernel, "f4"), f"bias{i}": np.asarray(bias, "f4")}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    write_atomically(path, buffer.getvalue())
+    write_arrays(path, _header(policy, provenance or {}), arrays)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    try:
-        # From memory: numpy leaves a file it cannot read open.
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            arrays = dict(file)
-        header = json.loads(str(arrays.pop("header")))
-    except FileNotFoundError:
-        raise JaxpendError(f"there is no policy file {path}") from None
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
-        raise JaxpendError(f"{path} is not a policy file, or it is empty or cut off") from None
+    header, arrays = read_arrays(path, "policy")
+    if header.get("kind", "policy") != "policy":
+        raise JaxpendError(f"{path} holds a {header['kind']}, not a policy alone")
     if header.get("format") != FORMAT:
         raise JaxpendError(f"{path} has policy format {header.get('format')}; this reads {FORMAT}")
     return header, arrays
 
 
 def read_header(robot_or_path: str | Path) -> dict[str, Any]:
-    """The JSON header of a policy file. Raises ``JaxpendError`` as ``load_policy``."""
-    return _read(_locate(robot_or_path))[0]
+    """The JSON header of a policy or controller file. Raises as ``arrays.read_arrays``."""
+    return read_arrays(_locate(robot_or_path), "policy")[0]
 
 
 def _locate(robot_or_path: str | Path) -> Path:

@@ -1,0 +1,42 @@
+"""Files of plain arrays and a JSON header: .npz without pickle, whole or not at all."""
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import JaxpendError
+from .files import write_atomically
+
+__all__ = ["read_arrays", "write_arrays"]
+
+
+def write_arrays(path: str | Path, header: dict[str, Any], arrays: Mapping[str, Any]) -> None:
+    """Write a file of named arrays and a header that JSON can hold, atomically."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, header=np.array(json.dumps(header)), **arrays)
+    write_atomically(path, buffer.getvalue())
+
+
+def read_arrays(path: Path, what: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of a file; ``what`` it should be is for the messages.
+
+    Raises:
+        JaxpendError: no such file, or not one that ``write_arrays`` wrote.
+    """
+    try:
+        # Read whole first: numpy leaves a broken file open.
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            arrays = dict(file)
+        header = json.loads(str(arrays.pop("header")))
+    except FileNotFoundError:
+        raise JaxpendError(f"there is no {what} file {path}") from None
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+        raise JaxpendError(f"{path} is not a {what} file, or it is empty or cut off") from None
+    if not isinstance(header, dict):
+        raise JaxpendError(f"{path} is not a {what} file, or it is empty or cut off")
+    return header, arrays

@@ -1,0 +1,131 @@
+"""Controller files: whatever the controller, it comes back whole, and a file cannot run code."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxpend import JaxpendError, Policy, designs, leaderboard, load_policy, robustness, score
+from jaxpend._struct import pytree, static
+from jaxpend.controllers import Feedback, Nominal, load_controller, lqr, save_controller
+from jaxpend.controllers.base import Memoryless
+from jaxpend.controllers.known import KNOWN, build, with_lqr
+from jaxpend.controllers.saved import classes_of
+from jaxpend.score import official
+
+PLANT = designs.competition("pendubot")
+
+
+@pytree
+class Own(Memoryless):
+    """A user's own controller, with parts of the package's."""
+
+    parts: tuple
+    wheels: int = static(default=4)
+
+    def __call__(self, carry, t, x):
+        return carry, self.parts[0](None, t, x)[1] / self.wheels
+
+
+def same(a, b):
+    """The same controller, to the bit."""
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+@pytest.mark.parametrize("name", [n for n in KNOWN if not n.startswith("mpc")])
+def test_every_known_controller_comes_back_whole(tmp_path, name):
+    made, path = build(name, PLANT, "pendubot"), tmp_path / "file.npz"
+    save_controller(path, made, "pendubot", {"seed": 7})
+    same(load_controller(path, robot="pendubot"), made)
+    with np.load(path, allow_pickle=False) as arrays:
+        assert json.loads(str(arrays["header"]))["provenance"] == {"seed": 7}
+    # In the precision of the one who loads it; a policy is float32 wherever it is.
+    if name != "policy":
+        with jax.enable_x64(True):
+            leaves = jax.tree.leaves(load_controller(path))
+            assert {str(leaf.dtype) for leaf in leaves} == {"float64"}
+
+
+def test_policies_are_policy_files(tmp_path):
+    path, policy = tmp_path / "policy.npz", load_policy("acrobot")
+    save_controller(path, policy, "acrobot")
+    same(load_policy(path), policy)
+    same(load_controller("acrobot"), policy)
+    save_controller(path, with_lqr(policy, PLANT, "acrobot"), "acrobot")
+    with pytest.raises(JaxpendError, match="holds a controller, not a policy alone"):
+        load_policy(path)
+
+
+def test_a_users_own_class_must_be_given(tmp_path):
+    own, path = Own((lqr(PLANT, "pendubot"), None)), tmp_path / "own.npz"
+    save_controller(path, own, "pendubot")
+    with pytest.raises(JaxpendError, match=r"unknown class of a controller 'Own'; known: .*TVLQR"):
+        load_controller(path)
+    assert Own in classes_of(own)
+    same(load_controller(path, classes=classes_of(own)), own)
+
+
+def test_what_a_file_cannot_hold_is_said(tmp_path):
+    with pytest.raises(JaxpendError, match=r"law is <.*; a file can hold arrays, numbers and text"):
+        save_controller(tmp_path / "file.npz", Feedback(lambda t, x: x[:2]), "pendubot")
+    assert not list(tmp_path.iterdir())
+
+
+def rewritten(path, change):
+    """The file of an LQR whose arrays and header ``change`` has had its way with."""
+    save_controller(path, lqr(PLANT, "pendubot"), "pendubot")
+    with np.load(path) as file:
+        arrays = dict(file)
+    header = json.loads(str(arrays["header"]))
+    change(arrays, header)
+    np.savez(path, **arrays | {"header": np.array(json.dumps(header))})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a, h: h.update(format=99), "has controller format 99"),
+        (lambda a, h: h.update(robot="cartpole"), "unknown robot 'cartpole'"),
+        (lambda a, h: h.update(robot="acrobot"), "for the acrobot, not for the pendubot"),
+        (lambda a, h: h["controller"].update({"class": "Popen"}), "unknown class"),
+        (lambda a, h: h["controller"].update({"class": "Plant"}), "not hold a whole controller"),
+        (lambda a, h: h["controller"]["fields"].pop("goal"), "not hold a whole controller"),
+        (lambda a, h: h.update(controller=3), "not hold a whole controller"),
+        (lambda a, h: a.pop("gain"), "not hold a whole controller: KeyError('gain')"),
+        (lambda a, h: a.update(gain=a["gain"][:, :3]), "not hold a whole controller"),
+        (lambda a, h: a.update(gain=a["gain"] * np.nan), "or holds nan"),
+        (lambda a, h: a.update(gain=a["gain"][:1], torque_limit=a["torque_limit"][:1]), "(2,)"),
+    ],
+)
+def test_damaged_contents_are_one_sentence(tmp_path, change, words):
+    path = tmp_path / "file.npz"
+    rewritten(path, change)
+    with pytest.raises(JaxpendError) as error:
+        load_controller(path, robot="pendubot")
+    assert words in str(error.value)
+    assert "Traceback" not in str(error.value)
+
+
+def test_commands_judge_a_controller_file(tmp_path, capsys):
+    path = tmp_path / "hybrid.npz"
+    layers = ((jnp.zeros((6, 3)), jnp.zeros(3)), (jnp.zeros((3, 1)), jnp.zeros(1)))
+    hybrid = with_lqr(Policy(layers, jnp.asarray(3.0)), PLANT, "pendubot")
+    save_controller(path, hybrid, "pendubot", {"seed": 1})
+    score.main("pendubot", str(path), json="-")
+    result = json.loads(capsys.readouterr().out)
+    assert result["criteria"] == official(hybrid, "pendubot")["criteria"]
+    assert result["header"]["provenance"] == {"seed": 1}
+    same(robustness._controller(str(path), None, "pendubot"), hybrid)
+    title, make = leaderboard._chosen("lqr", path, "pendubot")["own_policy"]
+    assert title == "hybrid"
+    same(make(PLANT), hybrid)
+
+
+def test_nominal_alone_is_no_controller(tmp_path):
+    nominal = Nominal(jnp.zeros((3, 4)), jnp.zeros(2), jnp.zeros((2, 5)))
+    save_controller(tmp_path / "file.npz", nominal, "pendubot")
+    with pytest.raises(JaxpendError, match="not hold a whole controller"):
+        load_controller(tmp_path / "file.npz")
