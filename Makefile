@@ -13,12 +13,13 @@ $(error ROBOT is '$(ROBOT)'; it must be acrobot or pendubot)
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help install train snes score robustness leaderboard test lint bench clean
+.PHONY: help install train snes score robustness leaderboard runs test lint bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 	@echo
 	@echo "variables: ROBOT=acrobot|pendubot  SEED=0  RUN=name  ARGS='--sac.steps 100000'"
+	@echo "the command behind them, with its own --help: $(BIN)/jaxpend"
 
 $(STAMP): pyproject.toml .constraints.txt
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and \
@@ -30,19 +31,22 @@ $(STAMP): pyproject.toml .constraints.txt
 install: $(STAMP)  ## make .venv with pinned versions
 
 train: $(STAMP)  ## SAC, then SNES, for ROBOT; ends with the official score
-	$(BIN)/python -m jaxpend.train --config experiments/$(ROBOT).yaml --seed $(SEED) --run $(RUN) $(ARGS)
+	$(BIN)/jaxpend train --config experiments/$(ROBOT).yaml --seed $(SEED) --run $(RUN) $(ARGS)
 
 snes: $(STAMP)  ## fine-tune a policy by SNES: ARGS='--policy FILE'
-	$(BIN)/python -m jaxpend.snes --robot $(ROBOT) --seed $(SEED) $(ARGS)
+	$(BIN)/jaxpend snes --robot $(ROBOT) --seed $(SEED) $(ARGS)
 
 score: $(STAMP)  ## official score of the shipped policy, or ARGS='--policy FILE'
-	$(BIN)/python -m jaxpend.score --robot $(ROBOT) $(ARGS)
+	$(BIN)/jaxpend score --robot $(ROBOT) $(ARGS)
 
 robustness: $(STAMP)  ## six-criterion robustness of the shipped policy, or ARGS='--policy FILE'
-	$(BIN)/python -m jaxpend.robustness --robot $(ROBOT) --seed $(SEED) $(ARGS)
+	$(BIN)/jaxpend robustness --robot $(ROBOT) --seed $(SEED) $(ARGS)
 
 leaderboard: $(STAMP)  ## every known controller on both boards, next to the published rows
-	$(BIN)/python -m jaxpend.leaderboard --robot $(ROBOT) $(ARGS)
+	$(BIN)/jaxpend leaderboard --robot $(ROBOT) $(ARGS)
+
+runs: $(STAMP)  ## list the runs with their state and scores
+	$(BIN)/jaxpend runs $(ARGS)
 
 test: $(STAMP)  ## the test suite
 	$(BIN)/python -m pytest $(ARGS)

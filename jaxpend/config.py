@@ -1,4 +1,7 @@
-"""What can be configured: frozen plain dataclasses that load, and print their help, without jax."""
+"""What can be configured: frozen plain dataclasses that load without jax.
+
+All raise ``JaxpendError`` for values that make no sense.
+"""
 
 import dataclasses
 import math
@@ -17,6 +20,7 @@ __all__ = [
     "SACRun",
     "SNESConfig",
     "SNESRun",
+    "Search",
     "TrainRun",
 ]
 
@@ -29,7 +33,7 @@ LINES = {"acrobot": 0.375, "pendubot": 0.35}
 
 @dataclasses.dataclass(frozen=True)
 class Reward:
-    """Coefficients of the surrogate reward; see ``surrogate_reward``."""
+    """Coefficients of the surrogate reward; see jaxpend.env.surrogate_reward."""
 
     line: float | None = None  # m, height that separates the regimes; None: see ``LINES``
     alpha: float = 2.0  # J, straight elbow above the line
@@ -44,7 +48,7 @@ class Reward:
 
 @dataclasses.dataclass(frozen=True)
 class EnvConfig:
-    """The learning environment. Raises ``JaxpendError`` for values that make no sense."""
+    """The learning environment."""
 
     robot: str = "pendubot"
     torque_limit: float = 3.0  # N m, torque at action 1
@@ -179,7 +183,7 @@ class SNESConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What every training run has. Raises ``JaxpendError`` for an unknown robot."""
+    """What every training run has."""
 
     robot: str = "pendubot"
     seed: int = 0
@@ -220,3 +224,15 @@ class TrainRun(SACRun):
     """SAC, then SNES from its best policy."""
 
     snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
+
+
+@dataclasses.dataclass(frozen=True)
+class Search:
+    """How widely to look."""
+
+    starts: int = 24  # random starts for each horizon
+    horizons: tuple[float, ...] = (1.2, 1.4, 1.6, 1.8, 2.1)  # s, of the first stage
+    horizon: float = 2.6  # s, of the other stages
+    hold: float = 1.0  # s of LQR appended, so that it ends at rest
+    keep: int = 6  # optima refined at 500 Hz
+    seed: int = 0

@@ -1,7 +1,7 @@
-"""``python -m jaxpend.leaderboard``: every controller on both v2 boards, next to published rows.
+"""``jaxpend leaderboard``: every controller on both v2 boards, next to published rows.
 
 Performance is the official score and its criteria in float64; robustness is the six-criterion
-benchmark in float32, as ``jaxpend.robustness`` runs it.
+benchmark in float32, as ``jaxpend robustness`` runs it.
 """
 
 import time
@@ -11,13 +11,12 @@ from typing import Any
 
 import jax
 
-from . import cli, designs
+from . import designs
 from .boards import HEADINGS, PUBLISHED
 from .controllers.known import KNOWN, build
 from .controllers.policy import load_policy
 from .controllers.saved import load_controller
 from .errors import JaxpendError, choose
-from .files import write_atomically
 from .robustness import CRITERIA, benchmark
 from .score import official
 from .terminal import console
@@ -118,7 +117,7 @@ def markdown(board: Mapping[str, Any]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
-def _show(board: Mapping[str, Any]) -> None:
+def show(board: Mapping[str, Any]) -> None:
     """Two tables that fit a terminal of 80 columns; robustness only if it was measured."""
     from rich.table import Table
 
@@ -147,7 +146,7 @@ def _ships_policy(robot: str) -> bool:
     return True
 
 
-def _chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[str, tuple]:
+def chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[str, tuple]:
     """Name -> (title, make) of what the command line asks for."""
     if controllers is None:
         names = [n for n in KNOWN if not n.startswith("policy") or _ships_policy(robot)]
@@ -166,38 +165,7 @@ def _chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[st
     return chosen
 
 
-def main(
-    robot: str = "pendubot",
-    controllers: str | None = None,
-    policy: Path | None = None,
-    robustness: bool = True,
-    keys: int = 1,
-    seed: int = 0,
-    json: str | None = None,
-    out: Path | None = None,
-) -> None:
-    """Judge controllers on performance and robustness, next to the published ones.
-
-    Args:
-        robot: acrobot or pendubot.
-        controllers: names separated by commas; by default all that are known.
-        policy: a policy or controller file to judge as well.
-        robustness: False leaves the robustness benchmark out (minutes for MPC).
-        keys: repetitions of what the benchmark draws at random.
-        seed: of the benchmark's first key.
-        json: write the result as JSON to this file, or "-" for standard output.
-        out: write the table as Markdown to this file.
-    """
-    choose("robot", robot, designs.ROBOTS)
-    chosen = _chosen(controllers, policy, robot)
-    say = lambda line: console.print(line, style="dim")  # noqa: E731
-    options = {"robustness": robustness, "keys": keys, "seed": seed}
-    board = leaderboard(robot, chosen, say=say, **options)
-    _show(board)
-    cli.emit_json(board, json)
-    if out is not None:
-        write_atomically(out, markdown(board))
-
-
 if __name__ == "__main__":
-    cli.run(main, "jaxpend.leaderboard")
+    from .cli import main
+
+    main("leaderboard")

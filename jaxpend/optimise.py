@@ -1,4 +1,4 @@
-"""``python -m jaxpend.optimise``: the best swing-up of a robot, from many random starts.
+"""``jaxpend optimise``: the best swing-up of a robot, from many random starts.
 
 1. Coarse (100 Hz): random sinusoids of torque over several horizons, one vmapped iLQR each; the
    final cost and the sharpness of the criteria grow from stage to stage. The horizon decides
@@ -9,20 +9,16 @@
    a closed loop (TVLQR) picks the winner.
 """
 
-import dataclasses
-import sys
-import time
 from functools import partial
-from pathlib import Path
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import cli, designs, ilqr, swingup
+from . import designs, ilqr, swingup
+from .config import Search
 from .controllers.lqr import lqr
-from .controllers.nominal import Nominal, save_nominal
+from .controllers.nominal import Nominal
 from .controllers.tvlqr import tvlqr
 from .rollout import rollout
 from .score import Criteria, criteria, score_v2
@@ -40,18 +36,6 @@ FINE_STAGES = ((10.0, 0.02, 0.02), (30.0, 0.01, 0.01), (30.0, 0.005, 0.01), (30.
 SHORT_ITERATIONS, LONG_ITERATIONS, FINE_ITERATIONS = 60, 100, 40
 # Two optima whose objectives differ by less than this are one.
 SAME = 1e-4
-
-
-@dataclasses.dataclass(frozen=True)
-class Search:
-    """How widely to look."""
-
-    starts: int = 24  # random starts for each horizon
-    horizons: tuple[float, ...] = (1.2, 1.4, 1.6, 1.8, 2.1)  # s, of the first stage
-    horizon: float = 2.6  # s, of the other stages
-    hold: float = 1.0  # s of LQR appended, so that it ends at rest
-    keep: int = 6  # optima refined at 500 Hz
-    seed: int = 0
 
 
 def _parameters(plant, robot, goal, dt, weight, line_width, power_width):
@@ -217,39 +201,7 @@ def find(robot: str, config: Search = Search(), *, say=lambda line: None):
     return sorted(found, key=lambda pair: -pair[1]["score"])
 
 
-def main(
-    robot: Literal["acrobot", "pendubot"],
-    out: Path | None = None,
-    json: str | None = None,
-    search: Search = Search(),
-) -> None:
-    """Find the best swing-up and write its trajectory file.
-
-    Args:
-        robot: which joint is driven.
-        out: trajectory file to write.
-        json: report of all optima to write; "-" for standard output.
-        search: how widely to look.
-    """
-    start = time.perf_counter()
-    say = lambda line: print(  # noqa: E731
-        f"[{time.perf_counter() - start:5.0f} s] {line}", file=sys.stderr, flush=True
-    )
-    with jax.enable_x64(True):
-        found = find(robot, search, say=say)
-    for _, report in found:
-        seconds, turns = report["criteria"]["swingup_time"], report["turns_of_theta2"]
-        say(f"score {report['score']:.4f}, up after {seconds:.2f} s, turns of theta2 {turns:+d}")
-    nominal, report = found[0]
-    command = f"python -m jaxpend.optimise --robot {robot} --search.seed {search.seed}"
-    if out is not None:
-        save_nominal(out, nominal, {"command": command, **report})
-        say(f"wrote {out}")
-    cli.emit_json(
-        {"robot": robot, "search": dataclasses.asdict(search), "optima": [r for _, r in found]},
-        json,
-    )
-
-
 if __name__ == "__main__":
-    cli.run(main, "jaxpend.optimise")
+    from .cli import main
+
+    main("optimise")

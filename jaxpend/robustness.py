@@ -1,4 +1,4 @@
-"""The six-criterion robustness benchmark of the RealAIGym v2 boards, and its command.
+"""The six-criterion robustness benchmark of the RealAIGym v2 boards.
 
 722 runs of 10 s: 10 plant parameters x 21 values, velocity noise and torque noise 21 values x
 10 repetitions, torque response and delay 21 values, 50 random series of disturbance pulses. A
@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,7 +23,7 @@ from .controllers.base import Controller
 from .errors import JaxpendError, choose
 from .plant import Plant
 from .scenario import Pulses, Scenario
-from .sweep import compile_sweep, mildest_failure, survey, sweep
+from .sweep import compile_sweep, survey, sweep
 from .variations import vary
 
 __all__ = ["CRITERIA", "Report", "Strip", "benchmark", "passes", "strips"]
@@ -263,10 +263,10 @@ def _report(grids, outcomes, keys, compile_seconds, run_seconds) -> Report:
     )
 
 
-# --- the command ---------------------------------------------------------------------------
+# --- for the command ---------------------------------------------------------------------------
 
 
-def _controller(policy: str | None, controller: str | None, robot: str) -> Controller:
+def find_controller(policy: str | None, controller: str | None, robot: str) -> Controller:
     """The policy, or what ``module:name`` names: a controller, or a Python function."""
     if controller is None:
         from .controllers.saved import load_controller
@@ -287,7 +287,7 @@ def _controller(policy: str | None, controller: str | None, robot: str) -> Contr
     return found if hasattr(found, "reset") else PythonLaw(found)
 
 
-def _nominal_and_worst(plant: Plant) -> dict[str, tuple[float, float]]:
+def nominal_and_worst(plant: Plant) -> dict[str, tuple[float, float]]:
     """For ``--worst``: from nothing wrong to the worst end of the official grids."""
     grids = {s.variation: s.values for s in strips(plant)}
     rising = {name: (0.0, grids[name][-1]) for name in ("b1", "b2", "cf1", "cf2", "Ir", "delay")}
@@ -295,91 +295,7 @@ def _nominal_and_worst(plant: Plant) -> dict[str, tuple[float, float]]:
     return rising | {"m2": (grids["m2"][10], grids["m2"][-1]), "responsiveness": (1.0, 0.1)}
 
 
-def _table(result: dict[str, Any], robot: str) -> None:
-    """Six percentages and the overall score, on standard error like all reports."""
-    from rich.table import Table
-
-    from .terminal import console
-
-    table = Table(title=f"{robot}: robustness, {result['simulations']} runs of 10 s")
-    for heading in ("", "score [%]", "over keys [%]", "diverged"):
-        table.add_column(heading, justify="right" if heading else "left")
-    over = result["over_keys"]
-    several = len(over["overall"]) > 1
-    for name, title in CRITERIA.items():
-        drawn = over["scores"].get(name) if several else None
-        spread = f"{100 * min(drawn):.1f} to {100 * max(drawn):.1f}" if drawn else ""
-        diverged = str(result["criteria"][name]["diverged"])
-        table.add_row(title, f"{100 * result['scores'][name]:.1f}", spread, diverged)
-    spread = f"{100 * over['mean']:.1f} ± {100 * over['std']:.1f}" if several else ""
-    table.add_row("Overall", f"[bold]{100 * result['overall']:.1f}[/bold]", spread, "")
-    console.print(table)
-    seconds = f"{result['run_seconds']:.1f} s for {len(over['overall'])} key" + "s" * several
-    console.print(f"{seconds}, compiled in {result['compile_seconds']:.1f} s", style="dim")
-    worst = result.get("worst")
-    if worst:
-        values = ", ".join(f"{k} = {v:.3g}" for k, v in (worst["values"] or {}).items())
-        console.print(f"{100 * worst['failures']:.1f} % of combined imperfections fail; {values}")
-
-
-def main(
-    robot: str = "pendubot",
-    policy: str | None = None,
-    controller: str | None = None,
-    torque_limit: float = 6.0,
-    seed: int = 0,
-    keys: int = 3,
-    precision: Literal["float32", "float64"] = "float32",
-    scored: bool = False,
-    map: tuple[str, str] | None = None,
-    worst: int = 0,
-    chunk: int | None = None,
-    out: Path | None = Path("runs/robustness"),
-    json: str | None = None,
-) -> None:
-    """The official six-criterion robustness benchmark of a controller.
-
-    Args:
-        robot: acrobot or pendubot.
-        policy: a policy or controller file; by default the policy that ships with the package.
-        controller: judge this instead: module:name of a jaxpend controller, or of a Python
-            function (t, x) -> torque, which takes minutes (see jaxpend.controllers.python).
-        torque_limit: of the driven joint, N m; 6 on the boards.
-        seed: of the first key.
-        keys: repeat the criteria that draw something this often, for the spread.
-        precision: float32, or float64 as the reference computes.
-        scored: the mean v2 performance score at every grid value as well.
-        map: success over two imperfections, such as "m2 delay", 21 x 21 runs.
-        worst: look for the mildest combination of imperfections that fails, in so many tries.
-        chunk: runs at a time; less needs less memory.
-        out: folder for picture, CSV and JSON, with both robots side by side once both are
-            there; None writes nothing.
-        json: write the result as JSON to this file, or "-" for standard output.
-    """
-    from . import cli, designs
-
-    with jax.enable_x64(precision == "float64"):
-        plant = designs.competition(robot, torque_limit)
-        judged = _controller(policy, controller, robot)
-        key = jax.random.key(seed)
-        result = {"robot": robot, "controller": controller or policy or robot, "seed": seed}
-        result |= {"precision": precision, "torque_limit": torque_limit}
-        options = {"scored": scored, "chunk": chunk}
-        result |= benchmark(judged, plant, key, keys=keys, **options).as_dict()
-        if map is not None:
-            result["map"] = _map(judged, plant, map, key, options)
-        if worst:
-            found = mildest_failure(plant, judged, _nominal_and_worst(plant), key, samples=worst)
-            result["worst"] = found
-    _table(result, robot)
-    if out is not None:
-        from .plots import write_robustness
-
-        write_robustness(result, out)
-    cli.emit_json(result, json)
-
-
-def _map(controller, plant, names, key, options) -> dict[str, Any]:
+def success_map(controller, plant, names, key, options) -> dict[str, Any]:
     """Success over the official values of two imperfections."""
     grids = {s.variation: s for s in strips(plant) if s.variation != "perturbation"}
     axes = {name: grids[choose("imperfection with a grid", name, grids)] for name in names}
@@ -392,6 +308,6 @@ def _map(controller, plant, names, key, options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    from .cli import run
+    from .cli import main
 
-    run(main, "jaxpend.robustness")
+    main("robustness")

@@ -6,14 +6,16 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
 
 from . import __version__
-from .controllers.policy import Policy, save_policy
 from .errors import JaxpendError
 from .files import to_json, write_atomically
+
+if TYPE_CHECKING:
+    from .controllers.policy import Policy
 
 __all__ = ["RunFolder", "from_mapping", "load_config", "to_mapping"]
 
@@ -105,8 +107,10 @@ class RunFolder:
         with (self.path / "metrics.jsonl").open("a") as file:
             file.write(to_json(row) + "\n")
 
-    def save(self, name: str, policy: Policy, **provenance: Any) -> Path:
+    def save(self, name: str, policy: "Policy", **provenance: Any) -> Path:
         """Write a policy file with the command and configuration that made it."""
+        from .controllers.policy import save_policy  # loads jax; configurations do without
+
         made_by = {"command": self.command, "version": __version__, "config": self.config}
         save_policy(self.path / name, policy, provenance | made_by)
         return self.path / name

@@ -276,7 +276,6 @@ def greedy_policy(config: SACConfig, state: SACState) -> Policy:
 
 
 if __name__ == "__main__":
-    from .config import SACRun
-    from .train import command
+    from .cli import main
 
-    command(SACRun, "jaxpend.sac", "SAC on the surrogate reward.")
+    main("sac")

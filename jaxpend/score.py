@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from ._struct import pytree
 from .controllers.base import Controller
-from .designs import active_joint, competition
+from .designs import competition
 from .errors import JaxpendError
 from .plant import Plant
 from .rollout import rollout
@@ -174,29 +174,6 @@ def score_v3(c: Criteria, t_final: float = 60.0) -> jax.Array:
     return c.uptime / t_final
 
 
-def main(robot: str = "pendubot", policy: str | None = None, json: str | None = None) -> None:
-    """Official v2 score of a policy or any other saved controller, in float64.
-
-    Args:
-        robot: acrobot or pendubot.
-        policy: a policy or controller file; by default the policy that ships with the package.
-        json: write the result as JSON to this file, or "-" for standard output.
-    """
-    from . import cli
-    from .controllers.policy import read_header
-    from .controllers.saved import load_controller
-    from .terminal import score_table
-
-    active_joint(robot)
-    with jax.enable_x64(True):
-        loaded = load_controller(policy or robot, robot=robot)
-    header = read_header(policy or robot)
-    result = official(loaded, robot) | {"policy": policy or robot, "header": header}
-    if json != "-":
-        score_table({str(policy or f"shipped {robot}"): result}, robot)
-    cli.emit_json(result, json)
-
-
 @partial(jax.jit, static_argnames="robot")
 def nominal(controller: Controller, robot: str) -> Criteria:
     """``performance`` on the plant of the v2 boards, compiled once a kind of controller."""
@@ -217,6 +194,6 @@ def official(controller: Controller, robot: str) -> dict:
 
 
 if __name__ == "__main__":
-    from .cli import run
+    from .cli import main
 
-    run(main, "jaxpend.score")
+    main("score")

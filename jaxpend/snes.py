@@ -144,7 +144,6 @@ def best_controller(config: SNESConfig, start: Controller, state: SNESState) -> 
 
 
 if __name__ == "__main__":
-    from .config import SNESRun
-    from .train import command
+    from .cli import main
 
-    command(SNESRun, "jaxpend.snes", "SNES on the official score, from any controller.")
+    main("snes")

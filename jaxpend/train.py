@@ -1,13 +1,12 @@
 """The whole job: SAC on the surrogate reward, then SNES on the official score, in a run folder."""
 
 import math
-import sys
 import time
 
 import jax
 
-from . import cli, sac, snes
-from .config import Run, SACConfig, SNESConfig, SNESRun, TrainRun
+from . import sac, snes
+from .config import Run, SACConfig, SNESConfig, SNESRun
 from .controllers.policy import Policy, load_policy
 from .errors import JaxpendError
 from .interrupt import Stopped, deferred, stop_if_asked
@@ -137,12 +136,7 @@ def execute(config: Run, command: str) -> None:
     console.print(f"policy.npz, metrics and result are in [bold]{config.folder}[/bold]")
 
 
-def command(kind: type[Run], prog: str, description: str) -> None:
-    """A training command: configuration from the command line, then ``execute``."""
-    with cli.guard(prog):
-        config = cli.configure(kind(), prog, description, also=("policy", "sac", "snes"))
-        execute(config, " ".join(["python -m", prog, *sys.argv[1:]]))
-
-
 if __name__ == "__main__":
-    command(TrainRun, "jaxpend.train", __doc__)
+    from .cli import main
+
+    main("train")

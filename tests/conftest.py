@@ -3,6 +3,7 @@
 Import from here: ``from conftest import assert_close``.
 """
 
+import os
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,6 +29,7 @@ both_robots = pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
 
 
 def pytest_configure(config):
+    os.environ["JAXPEND_CACHE"] = "off"  # every test compiles what it tests
     config.addinivalue_line("markers", "x64: run with 64-bit types enabled in jax")
 
 

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from jaxpend import JaxpendError, designs, leaderboard
+from jaxpend import JaxpendError, commands, designs, leaderboard
 from jaxpend.controllers import Zero, load_nominal, tvlqr
 
 
@@ -48,11 +48,11 @@ def test_robustness_is_part_of_the_row(monkeypatch):
 @pytest.mark.parametrize("robot", designs.ROBOTS)
 def test_unknown_names_list_the_known_ones(robot):
     with pytest.raises(JaxpendError, match=r"unknown controller 'foo'; known: .*tvlqr, mpc"):
-        leaderboard.main(robot=robot, controllers="tvlqr,foo")
+        commands.leaderboard(robot=robot, controllers="tvlqr,foo")
 
 
 def test_command_prints_json_only_on_standard_output():
-    command = "-m jaxpend.leaderboard --robot acrobot --controllers tvlqr --robustness False"
+    command = "-m jaxpend.leaderboard --robot acrobot --controllers tvlqr --no-robustness"
     command = [sys.executable, *command.split(), "--json", "-"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     rows = json.loads(done.stdout)["rows"]

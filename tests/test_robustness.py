@@ -11,7 +11,7 @@ import pytest
 from conftest import assert_close, both_robots, excerpt
 from test_policy import random_policy
 
-from jaxpend import JaxpendError, Scenario, cli, robustness, save_policy
+from jaxpend import JaxpendError, Scenario, cli, commands, robustness, save_policy
 from jaxpend.controllers import Feedback, Zero
 from jaxpend.controllers.python import PythonLaw
 from jaxpend.designs import competition
@@ -281,7 +281,7 @@ def test_bad_input_is_one_sentence(call, words):
 def test_command_writes_json_csv_and_pictures(tmp_path, capsys):
     path, out = tmp_path / "policy.npz", tmp_path / "out"
     save_policy(path, random_policy("acrobot", sizes=(8,)))
-    robustness.main("acrobot", policy=str(path), keys=2, out=out, json="-")
+    commands.robustness("acrobot", policy=str(path), keys=2, out=out, json="-")
     printed = json.loads(capsys.readouterr().out)
     assert 0 <= printed["overall"] <= 1
     assert list(printed["scores"]) == list(CRITERIA)
@@ -311,9 +311,9 @@ def test_command_writes_json_csv_and_pictures(tmp_path, capsys):
 def test_command_refuses_bad_input_in_one_sentence(tmp_path, monkeypatch, capsys, arguments, words):
     save_policy(tmp_path / "policy.npz", random_policy("acrobot", sizes=(8,)))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.argv", ["robustness", *arguments])
+    monkeypatch.setattr("sys.argv", ["jaxpend", "robustness", *arguments])
     with pytest.raises(SystemExit) as stop:
-        cli.run(robustness.main, "jaxpend.robustness")
+        cli.main()
     assert stop.value.code == 2
     message = capsys.readouterr().err.strip()
     assert words in message
@@ -325,7 +325,7 @@ def test_command_judges_a_python_function_by_name(tmp_path, monkeypatch):
     (tmp_path / "my_laws.py").write_text("def push(t, x):\n    return [1.0, 0.0]\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    law = robustness._controller(None, "my_laws:push", "pendubot")
+    law = robustness.find_controller(None, "my_laws:push", "pendubot")
     assert isinstance(law, PythonLaw)
     _, torque = law(None, 0.0, jnp.zeros(4))
     np.testing.assert_array_equal(torque, [1.0, 0.0])

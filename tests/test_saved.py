@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxpend import JaxpendError, Policy, designs, leaderboard, load_policy, robustness, score
+from jaxpend import JaxpendError, commands, Policy, designs, leaderboard, load_policy, robustness
 from jaxpend._struct import pytree, static
 from jaxpend.controllers import Feedback, Nominal, load_controller, lqr, save_controller
 from jaxpend.controllers.base import Memoryless
@@ -114,11 +114,11 @@ def test_commands_judge_a_controller_file(tmp_path, capsys):
     layers = ((jnp.zeros((6, 3)), jnp.zeros(3)), (jnp.zeros((3, 1)), jnp.zeros(1)))
     hybrid = with_lqr(Policy(layers, jnp.asarray(3.0)), PLANT, "pendubot")
     save_controller(path, hybrid, "pendubot", {"seed": 1})
-    score.main("pendubot", str(path), json="-")
+    commands.score("pendubot", str(path), json="-")
     result = json.loads(capsys.readouterr().out)
     assert result["criteria"] == official(hybrid, "pendubot")["criteria"]
     assert result["header"]["provenance"] == {"seed": 1}
-    same(robustness._controller(str(path), None, "pendubot"), hybrid)
+    same(robustness.find_controller(str(path), None, "pendubot"), hybrid)
     title, make = leaderboard._chosen("lqr", path, "pendubot")["own_policy"]
     assert title == "hybrid"
     same(make(PLANT), hybrid)

@@ -12,11 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxpend import Policy, cli, load_policy, save_policy, score
+from jaxpend import Policy, cli, load_policy, save_policy
 from jaxpend.config import SACRun, SNESRun, TrainRun
 from jaxpend.controllers.policy import read_header
 from jaxpend.score import official
-from jaxpend.train import command
 
 RECIPE = Path(__file__).parents[1] / "experiments" / "pendubot.yaml"
 CRITERIA = {
@@ -48,9 +47,14 @@ def rows_of(folder, stage):
 
 
 def run_command(monkeypatch, kind, *arguments):
-    """A training command in this process."""
-    monkeypatch.setattr("sys.argv", ["prog", *map(str, arguments)])
-    command(kind, "jaxpend.train", "words")
+    """A training command in this process. Raises SystemExit unless it exits with 0."""
+    name = {SACRun: "sac", SNESRun: "snes", TrainRun: "train"}[kind]
+    monkeypatch.setattr("sys.argv", ["jaxpend", name, *map(str, arguments)])
+    try:
+        cli.main()
+    except SystemExit as exit_:
+        if exit_.code:
+            raise
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +169,7 @@ def test_a_signal_stops_a_run_and_leaves_the_best_policy_so_far(tmp_path, stage,
 def one_sentence(err):
     """The last line on standard error, after checking that it is the only one that complains."""
     assert "Traceback" not in err
-    lines = [line for line in err.splitlines() if line.startswith(("jaxpend.", "prog:"))]
+    lines = [line for line in err.splitlines() if line.startswith("jaxpend ")]
     assert len(lines) == 1, err
     return lines[0]
 
@@ -240,9 +244,10 @@ def test_bad_input_to_the_score_command_is_one_sentence(
 ):
     policy_file(tmp_path, "acrobot")
     (tmp_path / "empty.npz").write_bytes(b"")
-    monkeypatch.setattr("sys.argv", ["prog", *options.format(tmp_path).split(), "--json", "-"])
+    line = ["jaxpend", "score", *options.format(tmp_path).split(), "--json", "-"]
+    monkeypatch.setattr("sys.argv", line)
     with pytest.raises(SystemExit) as exit_:
-        cli.run(score.main, "jaxpend.score")
+        cli.main()
     assert exit_.value.code == 2
     out, err = capsys.readouterr()
     assert out == ""
