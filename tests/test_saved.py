@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxpend import JaxpendError, commands, Policy, designs, leaderboard, load_policy, robustness
+from jaxpend import JaxpendError, Policy, commands, designs, leaderboard, load_policy, robustness
 from jaxpend._struct import pytree, static
 from jaxpend.controllers import Feedback, Nominal, load_controller, lqr, save_controller
 from jaxpend.controllers.base import Memoryless
@@ -119,7 +119,7 @@ def test_commands_judge_a_controller_file(tmp_path, capsys):
     assert result["criteria"] == official(hybrid, "pendubot")["criteria"]
     assert result["header"]["provenance"] == {"seed": 1}
     same(robustness.find_controller(str(path), None, "pendubot"), hybrid)
-    title, make = leaderboard._chosen("lqr", path, "pendubot")["own_policy"]
+    title, make = leaderboard.chosen("lqr", path, "pendubot")["own_policy"]
     assert title == "hybrid"
     same(make(PLANT), hybrid)
 
