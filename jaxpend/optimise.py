@@ -20,10 +20,9 @@ from .config import Search
 from .controllers.lqr import lqr
 from .controllers.nominal import Nominal
 from .controllers.tvlqr import tvlqr
-from .rollout import rollout
-from .score import Criteria, criteria, score_v2
+from .score import official
 
-__all__ = ["Search", "find", "official"]
+__all__ = ["Search", "find"]
 
 FINE_DT, COARSE_DT = 0.002, 0.01
 # (final weight, m line width, W power width) of each stage.
@@ -152,19 +151,6 @@ def _coarse(plant, robot, search: Search, say):
     return goal, labels, _stages(plant, robot, COARSE_DT, LONG_STAGES, LONG_ITERATIONS, goal, u)
 
 
-@jax.jit
-def _judge(plant, controller) -> tuple[jax.Array, Criteria]:
-    run = rollout(plant, controller, jax.random.key(0))
-    found = criteria(run.t, run.x, run.u, plant)
-    return score_v2(found), found
-
-
-def official(plant, nominal: Nominal) -> tuple[float, dict[str, float]]:
-    """Official v2 score and criteria of a swing-up played by TVLQR; float64 where jax has it."""
-    score, found = _judge(plant, tvlqr(plant, nominal))
-    return float(score), {name: float(value) for name, value in vars(found).items()}
-
-
 def find(robot: str, config: Search = Search(), *, say=lambda line: None):
     """The optimum trajectories found, best official score first: a list of (Nominal, report).
 
@@ -192,11 +178,11 @@ def find(robot: str, config: Search = Search(), *, say=lambda line: None):
             robot=robot,
             dt=FINE_DT,
         )
-        score, measured = official(plant, nominal)
+        measured = official(tvlqr(plant, nominal), robot)
         horizon, hits = labels[label]
         turns = round(float(goal[i, 1]) / (2 * np.pi))
-        report = {"score": score, "turns_of_theta2": turns, "first_horizon": horizon,
-                  "starts_that_led_there": hits, "criteria": measured}  # fmt: skip
+        report = {"score": measured["score"], "turns_of_theta2": turns, "first_horizon": horizon,
+                  "starts_that_led_there": hits, "criteria": measured["criteria"]}  # fmt: skip
         found.append((nominal, report))
     return sorted(found, key=lambda pair: -pair[1]["score"])
 

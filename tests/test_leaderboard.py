@@ -8,6 +8,7 @@ import pytest
 
 from jaxpend import JaxpendError, commands, designs, leaderboard
 from jaxpend.controllers import Zero, load_nominal, tvlqr
+from jaxpend.robustness import CRITERIA
 
 
 def test_measured_and_published_rows_in_one_order():
@@ -33,16 +34,22 @@ def test_robustness_is_part_of_the_row(monkeypatch):
     seen = {}
 
     class Found:
-        overall, overall_by_key, scores = 0.5, [0.5, 0.6], {"model": 1.0}
+        overall, overall_by_key = 0.5, [0.5, 0.7, 0.6]
+        scores, scores_by_key = {"model": 1.0, "delay": 0.1}, {"delay": [0.1, 0.3, 0.2]}
 
     def benchmark(controller, plant, key, *, keys):
         seen.update(dtype=plant.mass.dtype, keys=keys)
         return Found
 
     monkeypatch.setattr(leaderboard, "benchmark", benchmark)
-    row = leaderboard.judge(lambda plant: Zero(), "acrobot", keys=2)
-    assert (row["robustness"], row["robustness_criteria"]) == (0.5, {"model": 1.0})
-    assert (str(seen["dtype"]), seen["keys"]) == ("float32", 2)
+    row = leaderboard.judge(lambda plant: Zero(), "acrobot", keys=3)
+    assert row["robustness"] == 0.6
+    assert row["robustness_criteria"] == {"model": 1.0, "delay": 0.2}
+    assert (str(seen["dtype"]), seen["keys"]) == ("float32", 3)
+    row = {"title": "Nothing", "source": "measured", "success": False} | row
+    row["robustness_criteria"] = dict.fromkeys(CRITERIA, 0.25)
+    line = leaderboard.markdown({"rows": [row]}).splitlines()[-1]
+    assert line.endswith("| 0.25 | 0.600 (0.500 to 0.700) |")
 
 
 @pytest.mark.parametrize("robot", designs.ROBOTS)
