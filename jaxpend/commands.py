@@ -98,8 +98,10 @@ def robustness(
     Args:
         robot: acrobot or pendubot.
         policy: a policy or controller file; by default the policy that ships with the package.
-        controller: judge this instead: module:name of a jaxpend controller, or of a Python
-            function (t, x) -> torque, which takes minutes (see jaxpend.controllers.python).
+        controller: judge this instead: a known one such as tvlqr, or module:name of a
+            controller, or of a Python function (t, x) -> torque, which takes minutes (see
+            jaxpend.controllers.python). With a policy too: the known one around that policy, or
+            the file of a controller of your own classes.
         torque_limit: of the driven joint, N m; 6 on the boards.
         seed: of the first key.
         keys: repeat the criteria that draw something this often, for the spread.
@@ -116,13 +118,14 @@ def robustness(
     import jax
 
     from . import designs
-    from .robustness import benchmark, find_controller, nominal_and_worst, success_map
+    from .controllers.known import find_controller
+    from .robustness import benchmark, nominal_and_worst, success_map
     from .sweep import mildest_failure
     from .terminal import robustness_table
 
     with jax.enable_x64(precision == "float64"):
         plant = designs.competition(robot, torque_limit)
-        judged = find_controller(policy, controller, robot)
+        judged = find_controller(policy, controller, plant, robot)
         key = jax.random.key(seed)
         result = {"robot": robot, "controller": controller or policy or robot, "seed": seed}
         result |= {"precision": precision, "torque_limit": torque_limit}

@@ -10,10 +10,8 @@ edge of failure and no more; ``precision="float64"`` is the reference's arithmet
 
 import concurrent.futures
 import dataclasses
-import sys
 import time
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -264,27 +262,6 @@ def _report(grids, outcomes, keys, compile_seconds, run_seconds) -> Report:
 
 
 # --- for the command ---------------------------------------------------------------------------
-
-
-def find_controller(policy: str | None, controller: str | None, robot: str) -> Controller:
-    """The policy, or what ``module:name`` names: a controller, or a Python function."""
-    if controller is None:
-        from .controllers.saved import load_controller
-
-        return load_controller(policy or robot, robot=robot)
-    if policy is not None:
-        raise JaxpendError("give either a policy or a controller, not both")
-    import importlib
-
-    from .controllers.python import PythonLaw
-
-    module, _, name = controller.partition(":")
-    sys.path.insert(0, str(Path.cwd()))
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise JaxpendError(f"cannot load {controller} as module:name: {error}") from None
-    return found if hasattr(found, "reset") else PythonLaw(found)
 
 
 def nominal_and_worst(plant: Plant) -> dict[str, tuple[float, float]]:

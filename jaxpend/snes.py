@@ -20,7 +20,7 @@ from ._struct import pytree
 from .config import SNESConfig
 from .controllers.base import Controller
 from .controllers.parameters import coordinates
-from .controllers.policy import Policy
+from .controllers.policy import change_policies
 from .errors import JaxpendError
 from .randomisation import LONGEST_DELAY, sample
 from .score import performance, score_v2
@@ -39,16 +39,6 @@ class SNESState:
     diverged: jax.Array  # () int, rollouts that were not finite, so far
 
 
-def _with_noise(controller: Controller, sigma: float) -> tuple[Controller, bool]:
-    """The controller with noise on the actions of its policies, and whether it has any."""
-    is_policy = lambda part: isinstance(part, Policy)  # noqa: E731
-    parts, structure = jax.tree.flatten(controller, is_leaf=is_policy)
-    noisy = [p.replace(action_noise=jnp.float32(sigma)) if is_policy(p) else p for p in parts]
-    if not sigma or not any(map(is_policy, parts)):
-        return controller, False
-    return jax.tree.unflatten(structure, noisy), True
-
-
 def fitness(
     config: SNESConfig, controller: Controller, key: jax.Array, robot: str | None = None
 ) -> tuple[jax.Array, jax.Array]:
@@ -63,7 +53,9 @@ def fitness(
         raise JaxpendError(f"{type(controller).__name__} does not know its robot; name it")
     plant = designs.competition(robot)
     key_noise, key_scenario, key_run = jax.random.split(key, 3)
-    noisy, draws = _with_noise(controller, config.action_noise)
+    noise = jnp.asarray(config.action_noise, jnp.float32) if config.action_noise else None
+    noisy, policies = change_policies(controller, lambda p: p.replace(action_noise=noise))
+    draws = policies and config.action_noise
     keys = jax.random.split(key_noise, config.rollouts if draws else 1)
     c = jax.vmap(lambda k: performance(noisy, plant, k))(keys)
     # A diverged rollout has score 0 already; its velocity says that it diverged.

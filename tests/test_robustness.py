@@ -11,8 +11,9 @@ import pytest
 from conftest import assert_close, both_robots, excerpt
 from test_policy import random_policy
 
-from jaxpend import JaxpendError, Scenario, cli, commands, robustness, save_policy
+from jaxpend import JaxpendError, Scenario, cli, commands, save_policy
 from jaxpend.controllers import Feedback, Zero
+from jaxpend.controllers.known import find_controller
 from jaxpend.controllers.python import PythonLaw
 from jaxpend.designs import competition
 from jaxpend.robustness import CRITERIA, Strip, benchmark, passes, strips
@@ -304,7 +305,7 @@ def test_command_writes_json_csv_and_pictures(tmp_path, capsys):
         (["--robot", "pendubot", "--policy", "policy.npz"], "a policy for the acrobot"),
         (["--robot", "tricycle"], "unknown robot 'tricycle'; known: acrobot, pendubot"),
         (["--controller", "no_such_module:law"], "cannot load no_such_module:law"),
-        (["--policy", "policy.npz", "--controller", "a:b"], "not both"),
+        (["--policy", "policy.npz", "--controller", "pd"], "a policy for the acrobot"),
         (["--torque-limit", "0"], "torque limit is 0.0 N m; it must be positive"),
     ],
 )
@@ -325,7 +326,7 @@ def test_command_judges_a_python_function_by_name(tmp_path, monkeypatch):
     (tmp_path / "my_laws.py").write_text("def push(t, x):\n    return [1.0, 0.0]\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    law = robustness.find_controller(None, "my_laws:push", "pendubot")
+    law = find_controller(None, "my_laws:push", competition("pendubot"), "pendubot")
     assert isinstance(law, PythonLaw)
     _, torque = law(None, 0.0, jnp.zeros(4))
     np.testing.assert_array_equal(torque, [1.0, 0.0])

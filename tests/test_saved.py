@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxpend import JaxpendError, Policy, commands, designs, leaderboard, load_policy, robustness
+from jaxpend import JaxpendError, Policy, commands, designs, leaderboard, load_policy
 from jaxpend._struct import pytree, static
 from jaxpend.controllers import Feedback, Nominal, load_controller, lqr, save_controller
 from jaxpend.controllers.base import Memoryless
-from jaxpend.controllers.known import KNOWN, build, with_lqr
+from jaxpend.controllers.known import KNOWN, build, find_controller, with_lqr
 from jaxpend.controllers.saved import classes_of
 from jaxpend.score import official
 
@@ -27,6 +27,9 @@ class Own(Memoryless):
 
     def __call__(self, carry, t, x):
         return carry, self.parts[0](None, t, x)[1] / self.wheels
+
+
+OWN = Own((lqr(PLANT, "pendubot"), None))
 
 
 def same(a, b):
@@ -60,12 +63,12 @@ def test_policies_are_policy_files(tmp_path):
 
 
 def test_a_users_own_class_must_be_given(tmp_path):
-    own, path = Own((lqr(PLANT, "pendubot"), None)), tmp_path / "own.npz"
-    save_controller(path, own, "pendubot")
+    path = tmp_path / "own.npz"
+    save_controller(path, OWN, "pendubot")
     with pytest.raises(JaxpendError, match=r"unknown class of a controller 'Own'; known: .*TVLQR"):
         load_controller(path)
-    assert Own in classes_of(own)
-    same(load_controller(path, classes=classes_of(own)), own)
+    assert Own in classes_of(OWN)
+    same(load_controller(path, classes=classes_of(OWN)), OWN)
 
 
 def test_what_a_file_cannot_hold_is_said(tmp_path):
@@ -118,10 +121,30 @@ def test_commands_judge_a_controller_file(tmp_path, capsys):
     result = json.loads(capsys.readouterr().out)
     assert result["criteria"] == official(hybrid, "pendubot")["criteria"]
     assert result["header"]["provenance"] == {"seed": 1}
-    same(robustness.find_controller(str(path), None, "pendubot"), hybrid)
+    same(find_controller(path, None, PLANT, "pendubot"), hybrid)
     title, make = leaderboard.chosen("lqr", path, "pendubot")["own_policy"]
     assert title == "hybrid"
     same(make(PLANT), hybrid)
+
+
+def test_a_name_and_a_file_together(tmp_path):
+    """A known controller around the file's policy; or the file of one's own classes."""
+    path = tmp_path / "policy.npz"
+    layers = ((jnp.ones((6, 3)), jnp.zeros(3)), (jnp.ones((3, 1)), jnp.zeros(1)))
+    policy = Policy(layers, jnp.asarray(3.0, jnp.float32))
+    save_controller(path, policy, "pendubot")
+    same(find_controller(None, None, PLANT, "pendubot"), load_policy("pendubot"))
+    same(find_controller(None, "pd", PLANT, "pendubot"), build("pd", PLANT, "pendubot"))
+    found = find_controller(path, "policy_lqr", PLANT, "pendubot")
+    same(found, with_lqr(policy, PLANT, "pendubot"))
+    with pytest.raises(JaxpendError, match=r"pd is not built around a policy; leave out .*policy"):
+        find_controller(path, "pd", PLANT, "pendubot")
+    with pytest.raises(JaxpendError, match=r"unknown controller 'foo'; known: policy, .*tvlqr"):
+        find_controller(None, "foo", PLANT, "pendubot")
+    save_controller(path, OWN, "pendubot")
+    name = f"{__name__}:OWN"
+    same(find_controller(path, name, PLANT, "pendubot"), OWN)
+    assert find_controller(None, name, PLANT, "pendubot") is OWN
 
 
 def test_nominal_alone_is_no_controller(tmp_path):

@@ -1,11 +1,14 @@
 """The controllers that this package knows by name, ready to be judged."""
 
 import dataclasses
+import importlib
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import jax.numpy as jnp
 
-from ..errors import choose
+from ..errors import JaxpendError, choose
 from ..plant import Plant
 from .base import Controller, OpenLoop
 from .energy import energy_shaping
@@ -14,11 +17,13 @@ from .lqr import lqr
 from .mpc import free_mpc, tracking_mpc
 from .nominal import load_nominal
 from .pd import pd
-from .policy import load_policy
+from .policy import change_policies, load_policy
+from .python import PythonLaw
 from .riccati import riccati
+from .saved import classes_of, load_controller
 from .tvlqr import tvlqr
 
-__all__ = ["KNOWN", "Known", "build", "with_lqr"]
+__all__ = ["KNOWN", "Known", "build", "find_controller", "with_lqr"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,3 +81,44 @@ def build(name: str, plant: Plant, robot: str) -> Controller:
         JaxpendError: an unknown name; the message lists the known ones.
     """
     return KNOWN[choose("controller", name, KNOWN)].make(plant, robot)
+
+
+def find_controller(
+    policy: str | Path | None, controller: str | None, plant: Plant, robot: str
+) -> Controller:
+    """What ``--policy`` and ``--controller`` of a command name.
+
+    Args:
+        policy: a policy or controller file; None: the policy that ships with the package.
+        controller: a known name; or ``module:name``, a controller or a Python function, looked
+            for in the working directory too. With ``policy`` as well: the known controller
+            around that policy, or a file of the classes that ``module:name`` is made of.
+        plant: what a known controller is made for; its type is the precision.
+        robot: "acrobot" or "pendubot".
+
+    Raises:
+        JaxpendError: a file, a name or a module that cannot be used.
+    """
+    if not controller:
+        return load_controller(policy or robot, robot=robot)
+    if ":" in controller:
+        own = _imported(controller)
+        return load_controller(policy, robot=robot, classes=classes_of(own)) if policy else own
+    found = build(controller, plant, robot)
+    if not policy:
+        return found
+    given = load_policy(policy, robot=robot)
+    found, policies = change_policies(found, lambda shipped: given)
+    if not policies:
+        raise JaxpendError(f"{controller} is not built around a policy; leave out {policy}")
+    return found
+
+
+def _imported(name: str) -> Controller:
+    module, _, attribute = name.partition(":")
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise JaxpendError(f"cannot load {name} as module:name: {error}") from None
+    return found if hasattr(found, "reset") else PythonLaw(found)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar
@@ -62,6 +63,14 @@ class Policy:
         torque = self.torque_limit * jnp.tanh(pre)
         on_joint = np.arange(2) == active_joint(self.robot)
         return carry, jnp.where(on_joint, torque, jnp.zeros_like(torque))
+
+
+def change_policies(controller: Any, change: Callable[[Policy], Policy]) -> tuple[Any, int]:
+    """A controller with every policy in it changed, and how many those are."""
+    is_policy = lambda part: isinstance(part, Policy)  # noqa: E731
+    parts, structure = jax.tree.flatten(controller, is_leaf=is_policy)
+    changed = [change(part) if is_policy(part) else part for part in parts]
+    return jax.tree.unflatten(structure, changed), sum(map(is_policy, parts))
 
 
 def _header(policy: Policy, provenance: dict[str, Any]) -> dict[str, Any]:
