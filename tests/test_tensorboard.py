@@ -1,0 +1,61 @@
+"""TensorBoard events: the rows of the metrics, each once."""
+
+import json
+import struct
+import sys
+
+import pytest
+
+from jaxpend import JaxpendError
+from jaxpend.tensorboard import Events, require
+
+ROWS = [
+    {"stage": "sac", "seconds": 0.5, "env_steps": 64, "updates": 8, "score": 0.25, "loss": None},
+    {"stage": "sac", "seconds": 1.5, "env_steps": 128, "updates": 16, "score": 0.5, "loss": 2.0},
+    {"stage": "snes", "seconds": 2.5, "generation": 2, "mean_fitness": 0.75},
+]
+SCALARS = [
+    ("sac/updates", 64, 8.0), ("sac/score", 64, 0.25),
+    ("sac/updates", 128, 16.0), ("sac/score", 128, 0.5), ("sac/loss", 128, 2.0),
+    ("snes/mean_fitness", 2, 0.75),
+]  # fmt: skip
+
+
+def scalars(run):
+    """(tag, step, value) of every scalar in the one event file of a run folder."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    (path,) = (run / "tensorboard").iterdir()
+    data, found = path.read_bytes(), []
+    while data:  # TFRecord: length, its checksum, the event, its checksum
+        (size,) = struct.unpack("<Q", data[:8])
+        event, data = Event.FromString(data[12 : 12 + size]), data[16 + size :]
+        found += [(value.tag, event.step, value.simple_value) for value in event.summary.value]
+    return found
+
+
+def write(run, rows):
+    """Rows of metrics as training leaves them."""
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+def test_every_row_is_on_disk_once_whatever_went_before(tmp_path):
+    write(tmp_path, ROWS[:2])
+    events = Events(tmp_path)
+    assert scalars(tmp_path) == SCALARS[:5]
+    events.add(ROWS[2])
+    assert scalars(tmp_path) == SCALARS
+    events.close()
+    write(tmp_path, ROWS[:1])  # killed, and taken up again from an older checkpoint
+    events = Events(tmp_path)
+    for row in ROWS[1:]:
+        events.add(row)
+    events.close()
+    assert scalars(tmp_path) == SCALARS
+
+
+def test_a_missing_package_is_one_sentence(monkeypatch):
+    require()
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    with pytest.raises(JaxpendError, match=r"pip install 'jaxpend\[tensorboard\]'"):
+        require()
