@@ -190,7 +190,7 @@ def parse(
     given, target, default = [*args], _deferred(function), tyro.MISSING_NONPROP
     if "config" in hints:
         target, default, args = _configured(hints["config"], args)
-        summary += "\n\n--config FILE reads a YAML file first; the options override it."
+        summary += "\n--config FILE reads a YAML file first; the options override it."
     options = _options(target)
     if example:
         summary += f"\n\nexample: {prog} {example}"
