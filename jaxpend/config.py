@@ -189,6 +189,7 @@ class Run:
     seed: int = 0
     run: str = ""  # name of the run folder; empty: ROBOT-seedSEED, or ROBOT-snes-seedSEED
     runs: str = "runs"  # folder of the run folders
+    tensorboard: bool = False  # the metrics as TensorBoard events too, in RUN/tensorboard
 
     def __post_init__(self):
         active_joint(self.robot)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
 
-from . import __version__
+from . import __version__, tensorboard
 from .errors import JaxpendError
 from .files import to_json, write_atomically
 
@@ -88,6 +88,10 @@ class RunFolder:
 
     def __init__(self, path: str | Path, config: Any, command: str):
         self.path, self.command = Path(path), command
+        self._tensorboard = getattr(config, "tensorboard", False)
+        self._events: tensorboard.Events | None = None
+        if self._tensorboard:
+            tensorboard.require()
         if (self.path / "config.json").exists():
             raise JaxpendError(
                 f"{self.path} already holds a run; choose another name or remove the folder"
@@ -106,6 +110,10 @@ class RunFolder:
         row |= {k: v if isinstance(v, int | str) else float(v) for k, v in values.items()}
         with (self.path / "metrics.jsonl").open("a") as file:
             file.write(to_json(row) + "\n")
+        if self._events is not None:
+            self._events.add(row)
+        elif self._tensorboard:
+            self._events = tensorboard.Events(self.path)  # of all rows, this one too
 
     def save(self, name: str, policy: "Policy", **provenance: Any) -> Path:
         """Write a policy file with the command and configuration that made it."""

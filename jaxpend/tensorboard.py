@@ -4,6 +4,7 @@ import contextlib
 import json
 import shutil
 import time
+import weakref
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,7 @@ class Events:
         shutil.rmtree(run / "tensorboard", ignore_errors=True)
         (run / "tensorboard").mkdir()
         self._writer = EventsWriter(str(run / "tensorboard" / "events"))
+        weakref.finalize(self, self._writer.close)
         for line in (run / "metrics.jsonl").read_text().splitlines():
             with contextlib.suppress(ValueError):
                 self.add(json.loads(line))
@@ -54,7 +56,3 @@ class Events:
                 event = Event(wall_time=time.time(), step=row[column], summary=summary)
                 self._writer.write_event(event)
         self._writer.flush()
-
-    def close(self) -> None:
-        """Let go of the file."""
-        self._writer.close()

@@ -7,7 +7,9 @@ import sys
 import pytest
 
 from jaxpend import JaxpendError
-from jaxpend.tensorboard import Events, require
+from jaxpend.config import SNESRun
+from jaxpend.runs import RunFolder
+from jaxpend.tensorboard import Events
 
 ROWS = [
     {"stage": "sac", "seconds": 0.5, "env_steps": 64, "updates": 8, "score": 0.25, "loss": None},
@@ -45,17 +47,28 @@ def test_every_row_is_on_disk_once_whatever_went_before(tmp_path):
     assert scalars(tmp_path) == SCALARS[:5]
     events.add(ROWS[2])
     assert scalars(tmp_path) == SCALARS
-    events.close()
+    (path,) = (tmp_path / "tensorboard").iterdir()
+    path.rename(path.with_name("events.out.tfevents.1.before"))
     write(tmp_path, ROWS[:1])  # killed, and taken up again from an older checkpoint
     events = Events(tmp_path)
     for row in ROWS[1:]:
         events.add(row)
-    events.close()
     assert scalars(tmp_path) == SCALARS
 
 
-def test_a_missing_package_is_one_sentence(monkeypatch):
-    require()
+def test_a_run_folder_writes_events_only_if_asked(tmp_path):
+    config = SNESRun(tensorboard=True)
+    folder = RunFolder(tmp_path / "asked", config, "command")
+    for row in ROWS:
+        folder.log(**{name: value for name, value in row.items() if value is not None})
+    assert scalars(folder.path) == SCALARS
+    folder = RunFolder(tmp_path / "not", SNESRun(), "command")
+    folder.log(**ROWS[2])
+    assert not (folder.path / "tensorboard").exists()
+
+
+def test_a_missing_package_is_one_sentence_before_anything_is_made(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     with pytest.raises(JaxpendError, match=r"pip install 'jaxpend\[tensorboard\]'"):
-        require()
+        RunFolder(tmp_path / "run", SNESRun(tensorboard=True), "command")
+    assert not list(tmp_path.iterdir())
