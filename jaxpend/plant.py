@@ -118,7 +118,7 @@ def _is_frictionless(plant: Plant) -> bool:
     friction = plant.coulomb_friction
     if isinstance(friction, jax.core.Tracer):
         return False
-    return friction is None or not np.any(friction)
+    return friction is None or not np.asarray(friction).any()
 
 
 def friction_vector(plant: Plant, x: jax.Array) -> jax.Array:

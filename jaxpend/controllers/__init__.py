@@ -2,6 +2,7 @@
 
 from .base import Controller, Feedback, OpenLoop, Zero
 from .energy import EnergyShaping, energy_shaping
+from .guard import Guarded, guard
 from .hybrid import Ellipsoid, Hybrid, Tolerances, ellipsoid, ellipsoid_of_torque
 from .lqr import LQR, lqr
 from .mpc import MPC, free_mpc, tracking_mpc
@@ -21,6 +22,7 @@ __all__ = [
     "Ellipsoid",
     "EnergyShaping",
     "Feedback",
+    "Guarded",
     "Hybrid",
     "Nominal",
     "OpenLoop",
@@ -32,6 +34,7 @@ __all__ = [
     "ellipsoid_of_torque",
     "energy_shaping",
     "free_mpc",
+    "guard",
     "load_controller",
     "load_nominal",
     "load_policy",

@@ -6,10 +6,12 @@ import jax
 import jax.numpy as jnp
 
 from .._struct import pytree
-from .lqr import LQR, deviation
+from ..plant import Plant
+from .base import Controller
+from .lqr import LQR, deviation, lqr
 from .parameters import FACTOR
 
-__all__ = ["Ellipsoid", "Hybrid", "Tolerances", "ellipsoid", "ellipsoid_of_torque"]
+__all__ = ["Ellipsoid", "Hybrid", "Tolerances", "ellipsoid", "ellipsoid_of_torque", "with_lqr"]
 
 
 @pytree
@@ -82,3 +84,19 @@ class Hybrid:
         top_memory, top_torque = self.top(top_memory, t, x)
         torque = jnp.where(inside, top_torque, swing_torque)
         return (inside, swing_memory, top_memory), torque
+
+
+def with_lqr(
+    swingup: Controller,
+    plant: Plant,
+    robot: str,
+    *,
+    fraction: float = 1.0,
+    hysteresis: float = 4.0,
+) -> Hybrid:
+    """``swingup`` with LQR at the top, switched by the ellipsoid where LQR does not saturate.
+
+    ``fraction`` and ``hysteresis`` are those of ``ellipsoid_of_torque``.
+    """
+    top = lqr(plant, robot)
+    return Hybrid(swingup, top, ellipsoid_of_torque(top, fraction, hysteresis=hysteresis))

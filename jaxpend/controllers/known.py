@@ -12,7 +12,8 @@ from ..errors import JaxpendError, choose
 from ..plant import Plant
 from .base import Controller, OpenLoop
 from .energy import energy_shaping
-from .hybrid import Hybrid, ellipsoid_of_torque
+from .guard import guard
+from .hybrid import with_lqr
 from .lqr import lqr
 from .mpc import free_mpc, tracking_mpc
 from .nominal import load_nominal
@@ -23,7 +24,7 @@ from .riccati import riccati
 from .saved import classes_of, load_controller
 from .tvlqr import tvlqr
 
-__all__ = ["KNOWN", "Known", "build", "find_controller", "with_lqr"]
+__all__ = ["KNOWN", "Known", "build", "find_controller"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,15 +33,6 @@ class Known:
 
     title: str
     make: Callable[[Plant, str], Controller]
-
-
-def with_lqr(swingup: Controller, plant: Plant, robot: str, *, fraction: float = 1.0) -> Hybrid:
-    """``swingup`` with LQR at the top, switched by the ellipsoid where LQR does not saturate.
-
-    ``fraction`` is that of ``ellipsoid_of_torque``.
-    """
-    top = lqr(plant, robot)
-    return Hybrid(swingup, top, ellipsoid_of_torque(top, fraction))
 
 
 def _open_loop(plant: Plant, robot: str) -> Controller:
@@ -56,6 +48,9 @@ KNOWN: dict[str, Known] = {
         "Policy + LQR", lambda plant, robot: with_lqr(load_policy(robot), plant, robot)
     ),
     "tvlqr": Known("TVLQR", lambda plant, robot: tvlqr(plant, load_nominal(robot))),
+    "tvlqr_guarded": Known(
+        "TVLQR, guarded", lambda plant, robot: guard(tvlqr(plant, load_nominal(robot)), robot)
+    ),
     "mpc": Known("iLQR MPC", lambda plant, robot: tracking_mpc(plant, load_nominal(robot))),
     "mpc_free": Known("iLQR MPC, free", free_mpc),
     "riccati": Known(

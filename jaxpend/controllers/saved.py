@@ -21,6 +21,7 @@ from ..plant import Plant
 from ..robots import ROBOTS
 from .base import Controller, OpenLoop, Zero
 from .energy import EnergyShaping
+from .guard import Guarded, Observer, Rescue
 from .hybrid import Ellipsoid, Hybrid, Tolerances
 from .lqr import LQR
 from .mpc import MPC
@@ -34,8 +35,8 @@ __all__ = ["classes_of", "load_controller", "save_controller"]
 
 FORMAT = 1
 CLASSES = (
-    EnergyShaping, Ellipsoid, Hybrid, LQR, MPC, Nominal, Observation, OpenLoop, PD, Plant, Policy,
-    Riccati, Solution, TVLQR, Tolerances, Zero,
+    EnergyShaping, Ellipsoid, Guarded, Hybrid, LQR, MPC, Nominal, Observation, Observer, OpenLoop,
+    PD, Plant, Policy, Rescue, Riccati, Solution, TVLQR, Tolerances, Zero,
 )  # fmt: skip
 
 

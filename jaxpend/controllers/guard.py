@@ -1,0 +1,167 @@
+"""What a controller is wrapped in to survive a plant and sensors that are not the nominal ones.
+
+An extended state observer (Han, "From PID to active disturbance rejection control", 2009) estimates
+state and disturbance from the measured *angles* and the applied torque, so that neither noise nor
+delay of the velocity measurement reaches the controller:
+
+    x-  = f(x, u) + (d dt^2 / 2, d dt),   e = q - q-,   x = x- + (l1 e, l2 e),   d = d + l3 e
+
+with ``f`` one integration step of the nominal plant and ``d`` (rad/s^2) the acceleration that it
+does not explain. All three poles of the linear error lie at the bandwidth. On the nominal plant
+the estimate is exact but for rounding.
+
+A swing-up that has failed is left to a rescue: a controller for which time does not matter, such
+as energy shaping with LQR at the top. It takes over for good.
+"""
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._struct import pytree, static
+from ..designs import competition
+from ..errors import JaxpendError
+from ..plant import Plant, rk4_step
+from .base import Controller
+from .energy import energy_shaping
+from .hybrid import with_lqr
+from .lqr import deviation
+from .parameters import FACTOR
+
+__all__ = ["Guarded", "Observer", "Rescue", "guard", "observer"]
+
+# How far LQR is trusted when it ends a rescue: ``fraction`` and ``hysteresis`` of its ellipsoid.
+# Chosen on random scenarios by experiments/guard.py.
+REGION = {
+    "acrobot": {"fraction": 3.0, "hysteresis": 4.0},
+    "pendubot": {"fraction": 2.0, "hysteresis": 1.5},
+}
+
+
+@pytree
+class Observer:
+    """Estimates the state from measured angles; its memory is (started, x, d, torque)."""
+
+    plant: Plant  # the model; its torque limit clips what was asked for
+    gain: jax.Array  # (3,) l1, l2 (1/s), l3 (1/s^2)
+    dt: float = static(default=0.002)  # s, between calls
+
+    def reset(self):
+        """Memory before the first measurement."""
+        return jnp.array(False), jnp.zeros(4), jnp.zeros(2), jnp.zeros(2)
+
+    def __call__(self, memory, measured: jax.Array):
+        """New memory and estimated state (4,), given a measurement (4,). The first is believed."""
+        started, x, d, torque = memory
+        ahead = rk4_step(self.plant, x, torque, self.dt)
+        ahead = ahead + jnp.concatenate([0.5 * self.dt**2 * d, self.dt * d])
+        error = measured[:2] - ahead[:2]
+        estimate = ahead + jnp.concatenate([self.gain[0] * error, self.gain[1] * error])
+        estimate = jnp.where(started, estimate, measured).astype(x.dtype)
+        d = jnp.where(started, d + self.gain[2] * error, d).astype(d.dtype)
+        return (jnp.array(True), estimate, d, torque), estimate
+
+    def applied(self, memory, torque: jax.Array):
+        """Memory that knows the torque (2,), N m, asked for since the last estimate."""
+        limit = self.plant.torque_limit
+        return (*memory[:3], jnp.clip(torque, -limit, limit).astype(memory[3].dtype))
+
+
+def observer(plant: Plant, bandwidth: float, *, dt: float = 0.002) -> Observer:
+    """The observer of a plant with all error poles at ``bandwidth`` (rad/s), called every ``dt`` s.
+
+    Raises:
+        JaxpendError: bandwidth or dt is not positive.
+    """
+    if not (bandwidth > 0 and dt > 0):
+        raise JaxpendError(f"bandwidth = {bandwidth} rad/s and dt = {dt} s must be positive")
+    # Ackermann's formula for the triple integrator whose error is corrected after predicting.
+    a = np.array([[1, dt, dt**2 / 2], [0, 1, dt], [0, 0, 1]])
+    seen = np.vstack([a[0] @ np.linalg.matrix_power(a, k) for k in range(3)])
+    wanted = np.linalg.matrix_power(a - np.exp(-bandwidth * dt) * np.eye(3), 3)
+    return Observer(plant, wanted @ np.linalg.solve(seen, np.array([0.0, 0.0, 1.0])), dt)
+
+
+@pytree
+class Rescue:
+    """When the main controller counts as failed, and who takes over."""
+
+    SEARCHED: ClassVar = {"after": FACTOR, "radius": FACTOR}
+    controller: Any
+    after: jax.Array  # () s, before that it is still swinging up
+    radius: jax.Array  # () rad, of either angle around upright
+
+    def failed(self, t: jax.Array, x: jax.Array) -> jax.Array:
+        """Whether a state (4,) at time t is one that a swing-up that worked does not reach."""
+        error = deviation(x, jnp.array([jnp.pi, 0.0, 0.0, 0.0], x.dtype))
+        return (t > self.after) & (jnp.max(jnp.abs(error[:2])) > self.radius)
+
+
+@pytree
+class Guarded:
+    """``main`` behind an observer, before a rescue; either may be None."""
+
+    main: Any
+    observer: Observer | None = None
+    rescue: Rescue | None = None
+
+    def reset(self, key: jax.Array):
+        """Memories of the observer, of both controllers, and that nothing has failed."""
+        first, second = jax.random.split(key)
+        seen = None if self.observer is None else self.observer.reset()
+        lost = None
+        if self.rescue is not None:
+            lost = jnp.array(False), self.rescue.controller.reset(second)
+        return seen, lost, self.main.reset(first)
+
+    def __call__(self, carry, t, x):
+        """Memory and torque (2,), N m."""
+        seen, lost, memory = carry
+        if self.observer is not None:
+            seen, x = self.observer(seen, x)
+        memory, torque = self.main(memory, t, x)
+        if self.rescue is not None:
+            failed, rescue_memory = lost
+            failed = failed | self.rescue.failed(t, x)
+            rescue_memory, rescuing = self.rescue.controller(rescue_memory, t, x)
+            torque, lost = jnp.where(failed, rescuing, torque), (failed, rescue_memory)
+        if self.observer is not None:
+            seen = self.observer.applied(seen, torque)
+        return (seen, lost, memory), torque
+
+
+def guard(
+    main: Controller,
+    robot: str,
+    *,
+    bandwidth: float = 500.0,
+    rescue: bool = True,
+    after: float = 1.6,
+    radius: float = 0.6,
+) -> Controller:
+    """A controller guarded with the competition's plant (``designs.competition``) as the model.
+
+    Args:
+        main: the controller; without observer and rescue it is returned as it is.
+        robot: "acrobot" or "pendubot".
+        bandwidth: rad/s, of the observer; 0 leaves it out. Less where angles are noisy.
+        rescue: whether energy shaping and LQR take over a swing-up that failed.
+        after: s, the time that a swing-up may take.
+        radius: rad, of either angle around upright; beyond it a swing-up has failed.
+
+    Raises:
+        JaxpendError: an unknown robot, or a value out of range.
+    """
+    plant = competition(robot)
+    if not (after > 0 and radius > 0):
+        raise JaxpendError(f"after = {after} s and radius = {radius} rad must be positive")
+    seeing = observer(plant, bandwidth) if bandwidth else None
+    rescuing = None
+    if rescue:
+        swingup = with_lqr(energy_shaping(plant, robot), plant, robot, **REGION[robot])
+        rescuing = Rescue(swingup, np.asarray(after), np.asarray(radius))
+    if seeing is None and rescuing is None:
+        return main
+    return Guarded(main, seeing, rescuing)
