@@ -54,7 +54,7 @@ def test_robustness_is_part_of_the_row(monkeypatch):
 
 @pytest.mark.parametrize("robot", designs.ROBOTS)
 def test_unknown_names_list_the_known_ones(robot):
-    with pytest.raises(JaxpendError, match=r"unknown controller 'foo'; known: .*tvlqr, mpc"):
+    with pytest.raises(JaxpendError, match=r"unknown controller 'foo'; known: .*mpc, mpc_free"):
         commands.leaderboard(robot=robot, controllers="tvlqr,foo")
 
 

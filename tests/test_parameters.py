@@ -11,7 +11,7 @@ from conftest import assert_close
 from jaxpend import JaxpendError, Policy, designs
 from jaxpend._struct import pytree, static
 from jaxpend.controllers import TVLQR, Nominal, energy_shaping, lqr, pd, riccati
-from jaxpend.controllers.known import with_lqr
+from jaxpend.controllers.hybrid import with_lqr
 from jaxpend.controllers.parameters import FACTOR, KNOTS, OVER_TIME, WEIGHT, coordinates, kinds
 
 PLANT = designs.competition("acrobot")

@@ -11,7 +11,8 @@ from jaxpend import JaxpendError, Policy, commands, designs, leaderboard, load_p
 from jaxpend._struct import pytree, static
 from jaxpend.controllers import Feedback, Nominal, load_controller, lqr, save_controller
 from jaxpend.controllers.base import Memoryless
-from jaxpend.controllers.known import KNOWN, build, find_controller, with_lqr
+from jaxpend.controllers.hybrid import with_lqr
+from jaxpend.controllers.known import KNOWN, build, find_controller
 from jaxpend.controllers.saved import classes_of
 from jaxpend.score import official
 

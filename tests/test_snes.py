@@ -10,7 +10,7 @@ from conftest import assert_close
 
 from jaxpend import JaxpendError, Policy, designs, snes
 from jaxpend.controllers import load_nominal, lqr, tvlqr
-from jaxpend.controllers.known import with_lqr
+from jaxpend.controllers.hybrid import with_lqr
 from jaxpend.score import official, performance, score_v2
 from jaxpend.snes import SNESConfig
 

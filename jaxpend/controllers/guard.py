@@ -81,7 +81,8 @@ def observer(plant: Plant, bandwidth: float, *, dt: float = 0.002) -> Observer:
     a = np.array([[1, dt, dt**2 / 2], [0, 1, dt], [0, 0, 1]])
     seen = np.vstack([a[0] @ np.linalg.matrix_power(a, k) for k in range(3)])
     wanted = np.linalg.matrix_power(a - np.exp(-bandwidth * dt) * np.eye(3), 3)
-    return Observer(plant, wanted @ np.linalg.solve(seen, np.array([0.0, 0.0, 1.0])), dt)
+    gain = wanted @ np.linalg.solve(seen, np.array([0.0, 0.0, 1.0]))
+    return Observer(plant, jnp.asarray(gain), dt)
 
 
 @pytree
@@ -154,14 +155,14 @@ def guard(
     Raises:
         JaxpendError: an unknown robot, or a value out of range.
     """
-    plant = competition(robot)
+    plant = jax.tree.map(jnp.asarray, competition(robot))
     if not (after > 0 and radius > 0):
         raise JaxpendError(f"after = {after} s and radius = {radius} rad must be positive")
     seeing = observer(plant, bandwidth) if bandwidth else None
     rescuing = None
     if rescue:
         swingup = with_lqr(energy_shaping(plant, robot), plant, robot, **REGION[robot])
-        rescuing = Rescue(swingup, np.asarray(after), np.asarray(radius))
+        rescuing = Rescue(swingup, jnp.asarray(after), jnp.asarray(radius))
     if seeing is None and rescuing is None:
         return main
     return Guarded(main, seeing, rescuing)
