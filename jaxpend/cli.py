@@ -7,6 +7,7 @@ import functools
 import importlib
 import inspect
 import os
+import re
 import shlex
 import signal
 import sys
@@ -238,13 +239,18 @@ def _deferred(function: Callable[..., None]) -> Callable[..., Callable[[], None]
     def deferred(*args, **kwargs):
         return functools.partial(function, *args, **kwargs)
 
+    # A description that goes on in another line is one paragraph, which tyro breaks anew. It would
+    # read the docstring of what is wrapped.
+    deferred.__signature__ = inspect.signature(function)
+    del deferred.__wrapped__
+    deferred.__doc__ = re.sub(r"\n {8,}", " ", inspect.getdoc(function))
     return deferred
 
 
 def _options(kind: Any, prefix: str = "--") -> dict[str, Any]:
     """Name -> type of the options that a function or a configuration has."""
     found, parameters = {}, inspect.signature(kind).parameters
-    for name, hint in typing.get_type_hints(inspect.unwrap(kind)).items():
+    for name, hint in typing.get_type_hints(kind).items():
         if name not in parameters or parameters[name].kind is inspect.Parameter.POSITIONAL_ONLY:
             continue
         option = prefix + name.replace("_", "-")
@@ -299,7 +305,7 @@ def _complaint(
         if token.startswith("-"):
             known = [*options, "--config", "--help"]
             return f"unknown option {token}; {_similar(token, known) or help_}"
-        before = args[args.index(token) - 1] if args.index(token) else ""
+        before = args[args.index(token) - 1] if token in args[1:] else ""
         if options.get(before) is bool:
             return f"{before} is {token!r}; it must be yes or no"
         return f"unexpected argument {token!r}; {help_}"

@@ -100,6 +100,7 @@ def test_run_parses_calls_and_exits(monkeypatch, capsys, arguments, out):
         ("--keys", "--keys needs a value: an integer"),
         ("--plot perhaps --keys x", "--keys is 'x'; it must be an integer"),
         ("here --plot perhaps", "--plot is 'perhaps'; it must be yes or no"),
+        ("here --plot= --keys 1", "unexpected argument ''; see prog --help"),
         ("--kind quick", "--kind is 'quick'; it must be fast or slow"),
         ("--pair a", "--pair is 'a'; it must be 2 values, each a text"),
     ],
