@@ -1,10 +1,12 @@
-"""Time the parts of the main job on this machine: rollouts, SAC, SNES.
+"""Time the parts of the main job on this machine: rollouts, MPC, SAC, SNES.
 
     python experiments/bench.py            # or: make bench
+    python experiments/bench.py --parts mpc
 
-Compile and run times are given apart; every figure is the median of five runs.
+Compile and run times are given apart; every figure is the median of five runs, of MPC one run.
 """
 
+import argparse
 import time
 
 import jax
@@ -13,6 +15,7 @@ import numpy as np
 
 from jaxpend import Scenario, designs, sac, snes
 from jaxpend.controllers import Policy
+from jaxpend.controllers.known import build
 from jaxpend.observation import Observation
 from jaxpend.score import performance, score_v2
 
@@ -29,10 +32,10 @@ def random_policy(width: int) -> Policy:
     return Policy(layers, jnp.asarray(3.0), observation=observation, activation="tanh")
 
 
-def timed(f, *args) -> tuple[float, float]:
-    """Seconds of the first call beyond a run (compilation), and the median of five runs."""
+def timed(f, *args, runs: int = 5) -> tuple[float, float]:
+    """Seconds of the first call beyond a run (compilation), and the median of some runs."""
     seconds = []
-    for _ in range(6):
+    for _ in range(1 + runs):
         start = time.perf_counter()
         jax.block_until_ready(f(*args))
         seconds.append(time.perf_counter() - start)
@@ -40,27 +43,42 @@ def timed(f, *args) -> tuple[float, float]:
     return seconds[0] - run, run
 
 
-def main() -> None:
-    """Print the table."""
-    plant = designs.competition("pendubot")
-    print(f"jax {jax.__version__}, {jax.devices()[0].device_kind}, {jax.device_count()} device(s)")
-    print(f"{'':44s}{'compile [s]':>12s}{'run [s]':>10s}")
+def show(name: str, compile_time: float, seconds: float, speed: str = "") -> None:
+    """A line of the table."""
+    print(f"{name:44s}{compile_time:12.2f}{seconds:10.3f}  {speed}".rstrip(), flush=True)
 
+
+def rollouts(controller, robot: str, name: str, batches, runs: int = 5) -> None:
+    """Scored rollouts of 10 s in batches."""
+    plant = designs.competition(robot)
+    for batch in batches:
+        # Different starts: rollouts that are all the same would be computed once.
+        starts = 0.01 * jax.random.normal(jax.random.key(1), (batch, 4))
+
+        def scored(x0):
+            return score_v2(performance(controller, Scenario(plant, x0=x0), jax.random.key(0)))
+
+        compile_time, seconds = timed(jax.jit(jax.vmap(scored)), starts, runs=runs)
+        speed = f"({batch * 10 / seconds:,.1f} x real time)"
+        show(f"{batch} scored rollouts of 10 s, {name}", compile_time, seconds, speed)
+
+
+def bench_rollouts() -> None:
+    """Networks of two widths."""
     for width in (64, 256):
-        policy = random_policy(width)
-        for batch in (1, 64, 1024):
-            # Different starts: rollouts that are all the same would be computed once.
-            starts = 0.1 * jax.random.normal(jax.random.key(1), (batch, 4))
+        rollouts(random_policy(width), "pendubot", f"2x{width}", (1, 64, 1024))
 
-            def scored(x0, policy=policy):
-                return score_v2(performance(policy, Scenario(plant, x0=x0), jax.random.key(0)))
 
-            compile_time, seconds = timed(jax.jit(jax.vmap(scored)), starts)
-            print(
-                f"{f'{batch} scored rollouts of 10 s, 2x{width}':44s}{compile_time:12.2f}"
-                f"{seconds:10.3f}  ({batch * 10 / seconds:,.0f} x real time)"
-            )
+def bench_mpc() -> None:
+    """Both kinds of MPC on both robots: 5000 steps at 500 Hz."""
+    for robot in designs.ROBOTS:
+        for name in ("mpc", "mpc_free"):
+            controller = build(name, designs.competition(robot), robot)
+            rollouts(controller, robot, f"{name}, {robot}", (1, 64), runs=1)
 
+
+def bench_sac() -> None:
+    """Updates and steps of SAC."""
     config = sac.SACConfig(warmup_steps=0)
     state = sac.init(config, jax.random.key(0))
     vector_steps = 250
@@ -73,18 +91,34 @@ def main() -> None:
     compile_time, seconds = timed(chunk)
     updates = vector_steps * config.updates_per_step / seconds
     steps = vector_steps * config.num_envs / seconds
-    name = f"SAC: {vector_steps} vector steps, 2x128"
     speed = f"({updates:,.0f} updates/s, {steps:,.0f} steps/s)"
-    print(f"{name:44s}{compile_time:12.2f}{seconds:10.3f}  {speed}")
+    show(f"SAC: {vector_steps} vector steps, 2x128", compile_time, seconds, speed)
 
+
+def bench_snes() -> None:
+    """A generation without and with imperfect scenarios."""
     for scenarios in (0, 16):
         config = snes.SNESConfig(action_noise=0.0, scenarios=scenarios)
         policy = random_policy(64)
         start = snes.init(config, policy, jax.random.key(0))
         evolve = lambda s, c=config, p=policy: snes.evolve(c, p, s, 2)[1]  # noqa: E731
         compile_time, seconds = timed(evolve, start)
-        name = f"SNES: a generation of 40, {scenarios} scenarios, 2x64"
-        print(f"{name:44s}{compile_time:12.2f}{seconds / 2:10.3f}")
+        show(f"SNES: a generation of 40, {scenarios} scenarios, 2x64", compile_time, seconds / 2)
+
+
+PARTS = {"rollouts": bench_rollouts, "mpc": bench_mpc, "sac": bench_sac, "snes": bench_snes}
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    quick = [name for name in PARTS if name != "mpc"]
+    parser.add_argument("--parts", nargs="+", default=quick, choices=PARTS)
+    parts = parser.parse_args().parts
+    print(f"jax {jax.__version__}, {jax.devices()[0].device_kind}, {jax.device_count()} device(s)")
+    print(f"{'':44s}{'compile [s]':>12s}{'run [s]':>10s}")
+    for name in parts:
+        PARTS[name]()
 
 
 if __name__ == "__main__":
