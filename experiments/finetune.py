@@ -68,7 +68,7 @@ def table(rows: list[dict]) -> str:
     """Markdown: the controller as it was, then a line a seed."""
     lines = [
         "# Fine-tuning by SNES: `python experiments/finetune.py`", "",
-        "Robustness: median (range) over benchmark keys; seconds of SNES on a shared machine. A run",
+        "Robustness: median (range) over keys; seconds of SNES on a shared machine. A run",
         "with scenarios gives its last mean, the others the best by the official score.", "",
         "| case | controller | searched | scenarios | robot | seed | score | robustness | SNES |",
         "|---|---|---|---|---|---|---|---|---|",
