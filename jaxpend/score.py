@@ -15,7 +15,7 @@ from .controllers.base import Controller
 from .designs import competition
 from .errors import JaxpendError
 from .plant import Plant
-from .rollout import rollout
+from .rollout import Trajectory, rollout
 from .scenario import Scenario
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "Criteria",
     "criteria",
     "nominal",
+    "nominal_run",
     "official",
     "performance",
     "score_v1",
@@ -178,6 +179,14 @@ def score_v3(c: Criteria, t_final: float = 60.0) -> jax.Array:
 def nominal(controller: Controller, robot: str) -> Criteria:
     """``performance`` on the plant of the v2 boards, compiled once a kind of controller."""
     return performance(controller, competition(robot), jax.random.key(0))
+
+
+@partial(jax.jit, static_argnames="robot")
+def nominal_run(controller: Controller, robot: str) -> tuple[Trajectory, Criteria]:
+    """What ``nominal`` judges, and its criteria."""
+    plant = competition(robot)
+    run = rollout(plant, controller, jax.random.key(0))
+    return run, criteria(run.t, run.x, run.u, plant)
 
 
 def official(controller: Controller, robot: str) -> dict:

@@ -1,0 +1,157 @@
+"""``python -m jaxpend.report RUN``: one page about a run that needs nothing else, and pictures."""
+
+import dataclasses
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from .errors import JaxpendError
+
+__all__ = ["CURVES", "Found", "find", "main", "unfinished"]
+
+# Policies of a run, the final one first.
+POLICIES = ("policy.npz", "snes_best.npz", "sac_best.npz")
+# stage -> column on x, its name, what it counts up to, and the charts:
+# title, label -> column, label on y, logarithmic.
+CURVES = {
+    "sac": ("env_steps", "environment steps", "steps", (
+        ("Official score", {"best so far": "best", "now": "score"}, "v2 score", False),
+        ("Reward", {"reward": "reward"}, "mean of a step", False),
+        ("Temperature", {"temperature": "temperature"}, "", True),
+        ("Entropy of the policy", {"entropy": "entropy"}, "nats", False),
+        ("Loss of the critics", {"loss": "critic_loss"}, "", True),
+        ("Loss of the actor", {"loss": "actor_loss"}, "", False),
+    )),
+    "snes": ("generation", "generations", "generations", (
+        ("Fitness", {"mean": "mean_fitness", "best": "max_fitness"}, "noisy v2 score", False),
+        ("Official score", {"best so far": "best", "mean": "mean_score"}, "v2 score", False),
+        ("Standard deviation", {"sigma": "sigma"}, "of the parameters", False),
+    )),
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """What one run has left on disk so far."""
+
+    name: str
+    robot: str
+    config: dict  # empty for a policy without a run
+    rows: list[dict]  # of metrics.jsonl, in order
+    result: dict | None  # None: not finished
+    policy: str | None  # path, or robot for what ships with the package; None: none yet
+
+    @property
+    def stages(self) -> dict[str, tuple[int, int]]:
+        """Stage -> how far it is, and how far it is to go. The last chunk may go beyond."""
+        done = {}
+        for stage, (column, _, total, _) in CURVES.items():
+            if stage in self.config:
+                steps = [row[column] for row in self.rows if row["stage"] == stage]
+                goal = self.config[stage][total]
+                done[stage] = (min(max(steps, default=0), goal), goal)
+        return done
+
+
+def _json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text())
+    except ValueError:
+        raise JaxpendError(f"{path} is not valid JSON; the run cannot be read") from None
+
+
+def _rows(path: Path) -> list[dict]:
+    """Rows of metrics; what a crash cut off is left out, and what came twice counts once."""
+    rows = {}
+    for line in path.read_text().splitlines() if path.exists() else ():
+        try:
+            row = json.loads(line)
+            rows[row["stage"], row[CURVES[row["stage"]][0]]] = row
+        except (ValueError, KeyError, TypeError):
+            continue
+    return [rows[key] for key in sorted(rows, key=lambda key: (key[0], key[1]))]
+
+
+def _run(folder: Path) -> Found:
+    config = _json(folder / "config.json")
+    if not isinstance(config, dict) or "robot" not in config:
+        raise JaxpendError(f"{folder}/config.json is not the configuration of a run")
+    result = folder / "result.json"
+    return Found(
+        name=folder.name,
+        robot=config["robot"],
+        config=config,
+        rows=_rows(folder / "metrics.jsonl"),
+        result=_json(result) if result.exists() else None,
+        policy=next((str(folder / n) for n in POLICIES if (folder / n).exists()), None),
+    )
+
+
+def find(run: Path) -> list[Found]:
+    """The runs that a path means: a run folder, a folder of seeds, a policy file, or a robot's
+    name for the policy that ships with the package.
+
+    Raises:
+        JaxpendError: it is none of these, or cannot be read.
+    """
+    from .controllers.policy import read_header
+    from .robots import ROBOTS
+
+    seeds = sorted(
+        (p.parent for p in run.glob("seed*/config.json")),
+        key=lambda p: (int((re.findall(r"\d+", p.name) or ["0"])[0]), p.name),
+    )
+    if seeds:
+        return [_run(seed) for seed in seeds]
+    if (run / "config.json").exists():
+        return [_run(run)]
+    if run.is_file() or (str(run) in ROBOTS and not run.exists()):
+        return [Found(run.stem, read_header(run)["robot"], {}, [], None, str(run))]
+    raise JaxpendError(
+        f"{run} is not a run: give a folder that training has left (with config.json), a folder "
+        f"of seeds, a policy file, or {' or '.join(ROBOTS)} for the policy that ships"
+    )
+
+
+def unfinished(runs: Sequence[Found]) -> list[str]:
+    """What is not finished, a sentence each."""
+    sentences = []
+    for run in runs:
+        if run.config and run.result is None:
+            where = [
+                f"{stage.upper()} is at {done:,} of {total:,} {CURVES[stage][1]}"
+                for stage, (done, total) in run.stages.items()
+            ]
+            sentences.append(f"{run.name} is not finished: {', '.join(where)}.")
+    return sentences
+
+
+def main(run: Path, /, out: Path | None = None, robustness: bool = True) -> None:
+    """One page about a run, report.html, that needs no network, and pictures beside it.
+
+    Args:
+        run: a run folder, a folder of seeds, a policy file, or acrobot or pendubot for the
+            policy that ships with the package. A run that is not finished shows what is there.
+        out: folder for report.html and report/*.png; by default the run folder, or else
+            runs/NAME.
+        robustness: False leaves the robustness benchmark out, which takes seconds a seed.
+    """
+    from .terminal import console
+
+    runs = find(run)
+    for sentence in unfinished(runs):
+        console.print(sentence, highlight=False, soft_wrap=True)
+    from .page import write
+
+    folder = out or (run if run.is_dir() else Path("runs") / run.stem)
+    page = write(runs, folder, title=run.resolve().name, robustness=robustness)
+    line = f"the report is [bold]{page}[/bold]; pictures are in {page.with_suffix('')}"
+    console.print(line, highlight=False, soft_wrap=True)
+
+
+if __name__ == "__main__":
+    from .cli import run
+
+    run(main, "jaxpend.report")

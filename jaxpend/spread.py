@@ -1,0 +1,33 @@
+"""Numbers over seeds: the interquartile mean, and how far it may be off."""
+
+import numpy as np
+
+__all__ = ["interquartile_mean", "interval"]
+
+
+def interquartile_mean(values: np.ndarray) -> np.ndarray:
+    """Mean of the middle half of the seeds, which come first: (seeds, ...) -> (...).
+
+    Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice", 2021.
+    """
+    from scipy.stats import trim_mean
+
+    return trim_mean(np.asarray(values, float), 0.25, axis=0)
+
+
+def interval(values: np.ndarray, level: float = 0.95, resamples: int = 2000, seed: int = 0):
+    """Percentile bootstrap interval of the interquartile mean over seeds.
+
+    Args:
+        values: (seeds, ...); the seeds are drawn again together, whatever follows.
+        level: of confidence.
+        resamples: drawn with replacement, by numpy's generator from ``seed``.
+
+    Returns:
+        Lower and upper ends, each (...).
+    """
+    values = np.asarray(values, float)
+    rows = np.random.default_rng(seed).integers(len(values), size=(resamples, len(values)))
+    means = interquartile_mean(np.moveaxis(values[rows], 1, 0))
+    tail = (1 - level) / 2
+    return np.quantile(means, tail, axis=0), np.quantile(means, 1 - tail, axis=0)

@@ -1,0 +1,344 @@
+"""The page about a run: what it is made of, what it says, and how it behaves in a browser."""
+
+import dataclasses
+import json
+import re
+import shutil
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import browser
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxpend import cli, load_policy, page, report, save_policy
+from jaxpend.config import TrainRun
+from jaxpend.curves import _goals, _turns
+from jaxpend.designs import competition
+from jaxpend.robustness import benchmark, strips
+from jaxpend.runs import to_mapping
+from jaxpend.score import official
+
+# Characters that mean something in HTML must not.
+NAME = "odd <i> & \"co\""  # fmt: skip
+SNES = {"mean_fitness": 0.6, "max_fitness": 0.7, "sigma": 0.01}
+
+
+def sac(steps, score, **more):
+    return {"stage": "sac", "env_steps": steps, "score": score, "reward": 1.0, "seconds": 1} | more
+
+
+def make_run(folder, rows, *, policy="policy.npz", result=True, **config):
+    """A run folder as training leaves it, with the policy that ships as its policy."""
+    folder.mkdir(parents=True)
+    config = to_mapping(TrainRun(robot="pendubot", **config))
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    if policy:
+        made_by = {"command": "python -m jaxpend.train --seed <7>", "version": "0.0.7"}
+        save_policy(folder / policy, load_policy("pendubot"), made_by)
+    if result:
+        stage = {"score": 0.5, "success": False, "seconds": 61, "criteria": {}}
+        (folder / "result.json").write_text(json.dumps({"sac": stage, "score": 0.5}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A finished run, and its page with robustness."""
+    rows = [sac(0, 0.1), sac(25_000, 0.4, temperature=0.1, critic_loss=None), sac(50_000, 0.3)]
+    rows += [{"stage": "snes", "generation": g, "mean_score": 0.35, **SNES} for g in (10, 20)]
+    folder = make_run(tmp_path_factory.mktemp("runs") / NAME, rows, seed=4242)
+    few = [
+        dataclasses.replace(strip, values=strip.values[::5], repetitions=1)
+        for strip in strips(competition("pendubot"))
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page, "benchmark", partial(benchmark, grids=few))
+        path = page.write(report.find(folder), folder, title=NAME)
+    return SimpleNamespace(folder=folder, path=path, text=path.read_text())
+
+
+def cells(text, row):
+    """Texts of the cells of the table row that has ``row`` in its first cell."""
+    for line in re.findall(r"<tr.*?</tr>", text, re.DOTALL):
+        found = [re.sub("<[^>]*>", "", cell) for cell in re.findall(r"<t[dh].*?</t[dh]>", line)]
+        if found and row in found[0]:
+            return found
+    raise AssertionError(f"no row {row}")
+
+
+def test_the_page_says_the_official_score_and_what_costs_it(made):
+    truth = official(load_policy("pendubot"), "pendubot")
+    assert f"<dd>{truth['score']:.4f}</dd>" in made.text
+    rows = ("swing-up", "energy", "torque cost", "smoothness", "velocity cost")
+    costs = [float(cells(made.text, row)[-1]) for row in rows]
+    assert 1 - sum(costs) == pytest.approx(truth["score"], abs=3e-4)
+    assert cells(made.text, "energy")[1] == f"{truth['criteria']['energy']:.2f} J"
+    assert cells(made.text, "sum of the costs")[-1] == f"{truth['score']:.4f}"
+
+
+def test_the_page_ranks_the_run_among_the_published(made):
+    board = re.findall(r'<tr( class="own")?><td>(.*?)</td>.*?<td>([\d.]*)</td></tr>', made.text)
+    titles = [title for _, title, _ in board]
+    assert titles[:2] == ["odd &lt;i&gt; &amp; &#34;co&#34;", "HistorySAC"]
+    assert [own for own, _, _ in board[:2]] == [' class="own"', ""]
+    measured = json.loads((made.folder / "report" / "pendubot.json").read_text())
+    assert float(board[0][2]) == pytest.approx(measured["overall"], abs=6e-4)
+    assert cells(made.text, "Time delay")[-1] == f"{100 * measured['scores']['delay']:.1f} %"
+
+
+def test_the_page_says_how_the_run_was_made(made):
+    assert "python -m jaxpend.train --seed &lt;7&gt;" in made.text
+    assert "Trained by jaxpend 0.0.7" in made.text
+    assert cells(made.text, "seed")[1:] == ["4242", "0"]
+    assert "not finished" not in made.text
+    assert cells(made.text, "after SAC")[1:] == ["0.5000", "none", "61 s"]
+
+
+def test_the_page_is_whole_without_a_network(made):
+    assert not re.search(r'(src|href)="(?!#|data:)', re.sub(r'xlink:href="#', "", made.text))
+    assert not re.search(r"@import|url\((?!#)", made.text)
+    assert "<i> &" not in made.text
+    # Every chart has words for those who do not see it, and no colour that a page cannot change.
+    charts = re.findall(r"<svg [^>]*>", made.text)
+    assert len(charts) == 6 + 4 + 8 - 2 + 1
+    assert all('role="img"' in chart and 'aria-label="' in chart for chart in charts)
+    assert "var(--one)" in made.text.split("</style>", 1)[1]
+    assert "#0072b2" not in made.text.split("</style>", 1)[1]
+
+
+def test_pictures_are_beside_the_page(made):
+    folder = made.folder / "report"
+    names = {"learning.png", "phase.png", "robustness.png", "swingup.png", "swingup.gif"}
+    assert {path.name for path in folder.iterdir()} == names | {"pendubot.json", "pendubot.csv"}
+    for name in sorted(names):
+        with Image.open(folder / name) as image:
+            image.load()
+            assert min(image.size) >= 300
+            assert len(image.convert("RGB").getcolors(1 << 24)) > 10
+    with Image.open(folder / "swingup.gif") as film:
+        assert film.n_frames == 3 * 25
+        pictures = []
+        for frame in (0, 20, 74):
+            film.seek(frame)
+            pictures.append(np.asarray(film.convert("RGB"), int))
+    # It hangs at first, and stands at the end.
+    drawn = [np.argwhere(np.ptp(p, axis=2) > 100)[:, 0].mean() / len(p) for p in pictures]
+    assert drawn[0] > 0.55
+    assert drawn[-1] < 0.45
+
+
+def test_a_run_that_is_not_finished_shows_what_is_there(tmp_path, capsys):
+    folder = make_run(tmp_path / "half", [sac(0, 0.1)], policy="sac_best.npz", result=False)
+    with (folder / "metrics.jsonl").open("a") as file:
+        file.write('{"stage": "sac", "env_steps": 50')
+    report.main(folder, robustness=False)
+    text = (folder / "report.html").read_text()
+    words = "half is not finished: SAC is at 0 of 600,000 environment steps, SNES is at 0 of 400"
+    assert words in text
+    assert words in capsys.readouterr().err
+    assert "the best policy so far" in text
+    assert "robustness" not in re.sub(r"<style.*?</style>|<thead.*?</thead>", "", text, flags=re.S)
+
+
+def test_a_run_without_a_policy_has_a_page_too(tmp_path):
+    folder = make_run(tmp_path / "young", [], policy=None, result=False)
+    report.main(folder)
+    text = (folder / "report.html").read_text()
+    assert "there is no policy yet" in text
+    assert "<canvas" not in text
+    assert not (folder / "report").exists()
+
+
+def test_seeds_keep_their_axis(tmp_path):
+    for seed, score in ((10, 0.4), (2, 0.2)):
+        rows = [sac(0, 0.1), sac(25_000, score), sac(50_000, 0.0)]
+        make_run(tmp_path / "many" / f"seed{seed}", rows, seed=seed)
+    make_run(tmp_path / "many" / "seed1", [sac(0, 0.0)], policy=None, result=False, seed=1)
+    runs = report.find(tmp_path / "many")
+    assert [run.name for run in runs] == ["seed1", "seed2", "seed10"]
+    path = page.write(runs, tmp_path / "out", title="many", robustness=False)
+    text = path.read_text()
+    score = f"{official(load_policy('pendubot'), 'pendubot')['score']:.4f}"
+    assert cells(text, "seed10")[1] == score
+    assert cells(text, "seed10")[-1] == "yes"
+    assert [cells(text, "seed1")[k] for k in (1, -1)] == ["", "no"]
+    for row in ("median", "interquartile mean"):
+        assert cells(text, row)[1] == score
+    assert "seed1 is not finished" in text
+    assert text.count("<option value=") == 2 + 4
+
+
+def test_curves_know_the_best_so_far_through_all_stages(made):
+    (run,) = report.find(made.folder)
+    x, y = page._curve(run, "sac", "best")
+    assert (x.tolist(), y.tolist()) == ([0, 25_000, 50_000], [0.1, 0.4, 0.4])
+    assert page._curve(run, "snes", "best")[1].tolist() == [0.4, 0.4]
+    assert [len(page._curve(run, "sac", name)[0]) for name in ("temperature", "critic_loss")] == [
+        1,
+        0,
+    ]
+
+
+def test_rows_that_came_twice_count_once_in_order(tmp_path):
+    rows = [sac(50, 0.1), sac(25, 0.2), sac(50, 0.3), {"stage": "else"}, ["no row"]]
+    folder = make_run(tmp_path / "resumed", rows)
+    found = [(row["env_steps"], row["score"]) for row in report.find(folder)[0].rows]
+    assert found == [(25, 0.2), (50, 0.3)]
+
+
+def test_policies_can_be_shown_without_a_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (shipped,) = report.find(Path("acrobot"))
+    assert (shipped.robot, shipped.name, shipped.rows, shipped.config) == ("acrobot",) * 2 + (
+        [],
+        {},
+    )
+    save_policy(tmp_path / "mine.npz", load_policy("pendubot"))
+    (own,) = report.find(Path("mine.npz"))
+    assert (own.robot, own.name) == ("pendubot", "mine")
+    report.main(Path("mine.npz"), robustness=False)
+    assert "Learning" not in (tmp_path / "runs" / "mine" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("prepare", "words"),
+    [
+        (lambda folder: None, "is not a run: give a folder that training has left"),
+        (lambda folder: folder.mkdir(), "is not a run: give a folder that training has left"),
+        (lambda folder: make_run(folder, []).joinpath("config.json").write_text("{"), "valid JSON"),
+        (
+            lambda folder: make_run(folder, []).joinpath("config.json").write_text("[]"),
+            "is not the",
+        ),
+        (lambda folder: make_run(folder, []).joinpath("policy.npz").write_bytes(b""), "cut off"),
+        (lambda folder: folder.write_text("text"), "is not a policy file"),
+    ],
+)
+def test_what_is_not_a_run_is_one_sentence(tmp_path, monkeypatch, capsys, prepare, words):
+    monkeypatch.chdir(tmp_path)
+    prepare(tmp_path / "thing")
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.setattr("sys.argv", ["report", "thing"])
+    with pytest.raises(SystemExit) as stop:
+        cli.run(report.main, "jaxpend.report")
+    assert stop.value.code == 2
+    message = capsys.readouterr().err.strip()
+    assert words in message
+    assert "\n" not in message
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_angles_are_shown_in_half_turns_and_goals_where_the_arm_ended():
+    assert [_turns(k * np.pi / 2) for k in (-3, -2, -1, 0, 1, 2, 4)] == [
+        "\N{MINUS SIGN}3π/2", "\N{MINUS SIGN}π", "\N{MINUS SIGN}π/2", "0", "π/2", "π", "2π",
+    ]  # fmt: skip
+    assert _goals(np.array([[-3.0, 6.2, 0, 0]])) == (-np.pi, 2 * np.pi)
+    assert _goals(np.array([[3.3, 0.1, 0, 0]])) == (np.pi, 0)
+
+
+# --- in a browser --------------------------------------------------------------------------
+
+MOVES = """new Promise(resolve => {
+  const clock = document.getElementById('clock'), stage = document.getElementById('stage');
+  const time = clock.textContent, picture = stage.toDataURL();
+  const look = () => clock.textContent !== time && stage.toDataURL() !== picture
+    ? resolve([time, clock.textContent]) : requestAnimationFrame(look);
+  look();
+})"""
+# Nothing that should move has moved after this many frames.
+FRAMES = """new Promise(resolve => {
+  let left = 20;
+  const wait = () => left-- ? requestAnimationFrame(wait) : resolve(
+    [document.getElementById('clock').textContent, document.getElementById('stage').toDataURL()]);
+  wait();
+})"""
+
+
+@pytest.fixture(scope="module")
+def tab():
+    """A tab of a real browser."""
+    if browser.found() is None:
+        pytest.skip(f"no browser: none of {', '.join(browser.NAMES)} is installed")
+    with browser.chromium() as tab:
+        yield tab
+
+
+def complaints(tab):
+    """What the page logged, threw or asked the network for."""
+    bad = []
+    for method, params in tab.events:
+        if method in ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"):
+            bad.append(params)
+        elif method == "Network.requestWillBeSent":
+            url = params["request"]["url"]
+            if params["type"] != "Document" and not url.startswith("data:"):
+                bad.append(url)
+    return bad
+
+
+def test_the_animation_plays_pauses_and_seeks(made, tab):
+    tab.show(made.path)
+    before, after = tab.value(MOVES)
+    assert before.endswith(" s")
+    assert before != after
+    assert tab.value("document.getElementById('play').textContent") == "Pause"
+    tab.value("document.getElementById('play').click()")
+    paused = tab.value(FRAMES)
+    assert tab.value(FRAMES) == paused
+    seek = "document.getElementById('seek')"
+    tab.value(f"{seek}.value = 5; {seek}.dispatchEvent(new Event('input'))")
+    assert tab.value("document.getElementById('clock').textContent") == "5.00 s"
+    # Upright, above the line.
+    assert float(tab.value("parseFloat(document.getElementById('height').textContent)")) > 0.45
+    assert complaints(tab) == []
+
+
+def test_the_page_is_calm_where_motion_is_not_wanted(made, tab):
+    tab.show(made.path, features={"prefers-reduced-motion": "reduce"})
+    still = tab.value(FRAMES)
+    assert tab.value(FRAMES) == still
+    assert tab.value("document.getElementById('play').textContent") == "Play"
+    tab.value("document.getElementById('play').click()")
+    tab.value(MOVES)
+    assert complaints(tab) == []
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_a_phone_shows_all_of_it_legibly(made, tab, theme):
+    features = {"prefers-color-scheme": theme, "prefers-reduced-motion": "reduce"}
+    tab.show(made.path, width=390, height=844, features=features, mobile=True)
+    assert tab.value("[innerWidth, document.documentElement.scrollWidth]") == [390, 390]
+    tab.value("document.querySelectorAll('details').forEach(e => { e.open = true; })")
+    # The smallest text of a chart, in pixels; tables fit without scrolling.
+    sizes = """[...document.querySelectorAll('.charts svg text')].map(
+        text => { const m = text.getScreenCTM();
+            return parseFloat(getComputedStyle(text).fontSize) * Math.hypot(m.a, m.b); })"""
+    sizes = tab.value(sizes)
+    assert len(sizes) > 100
+    assert min(sizes) > 9
+    wide = (
+        "[...document.querySelectorAll('.scroll')].filter(e => e.scrollWidth > e.clientWidth + 1)"
+    )
+    assert tab.value(f"{wide}.length") == 0
+    ink = tab.value("getComputedStyle(document.querySelector('figure svg text')).fill")
+    assert ink == {"light": "rgb(26, 29, 33)", "dark": "rgb(233, 235, 238)"}[theme]
+    broken = "[...document.images].filter(i => !i.complete || !i.naturalWidth).length"
+    assert tab.value(broken) == 0
+    assert complaints(tab) == []
+
+
+def test_a_page_that_fails_is_noticed(made, tab, tmp_path):
+    broken = tmp_path / "report.html"
+    shutil.copy(made.path, broken)
+    text = made.text.replace(
+        '"use strict";', 'fetch("https://example.org/x").catch(() => 0); oops();'
+    )
+    broken.write_text(text.replace("default-src 'none';", "default-src *;"))
+    tab.show(broken)
+    found = json.dumps(complaints(tab))
+    assert "oops is not defined" in found
+    assert "https://example.org/x" in found
