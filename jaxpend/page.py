@@ -15,7 +15,8 @@ from . import __version__, plots
 from .animation import gif, keyframes
 from .boards import HEADINGS, PUBLISHED
 from .config import SACRun, SNESRun, TrainRun
-from .controllers.policy import load_policy, read_header
+from .controllers.policy import read_header
+from .controllers.saved import load_controller
 from .curves import draw_angles, draw_curves, draw_height, draw_phase, draw_torque, draw_velocities
 from .designs import competition
 from .files import write_atomically
@@ -49,19 +50,19 @@ class Judged:
 
 
 def judge(found: Found, robustness: bool = True) -> Judged | None:
-    """The swing-up of the best policy so far, its official score and its robustness.
+    """The swing-up of the best policy so far, its official score (float64) and its robustness.
 
     None where there is no policy yet. The policies of several seeds share one compilation.
     """
     if found.policy is None:
         return None
 
-    policy = load_policy(found.policy, robot=found.robot)
     with jax.enable_x64(True):
-        run, c = nominal_run(policy, found.robot)
+        run, c = nominal_run(load_controller(found.policy, robot=found.robot), found.robot)
         score = float(score_v2(c))
     report = None
     if robustness:
+        policy = load_controller(found.policy, robot=found.robot)
         nominal = competition(found.robot)
         report = benchmark(policy, nominal, jax.random.key(0)).as_dict()
     return Judged(
