@@ -71,6 +71,11 @@ COMMANDS = {
         "list runs with their state and scores",
         "runs --json -",
     ),
+    "report": Command(
+        "look at runs",
+        "one page about a run, with pictures",
+        "runs/mine",
+    ),
     "optimise": Command(
         "optimise a trajectory",
         "find the best swing-up",

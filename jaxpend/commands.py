@@ -14,7 +14,17 @@ from .config import SACRun, Search, SNESRun, TrainRun
 from .files import write_atomically
 from .robots import active_joint
 
-__all__ = ["leaderboard", "optimise", "robustness", "runs", "sac", "score", "snes", "train"]
+__all__ = [
+    "leaderboard",
+    "optimise",
+    "report",
+    "robustness",
+    "runs",
+    "sac",
+    "score",
+    "snes",
+    "train",
+]
 
 
 def train(config: TrainRun, command: str) -> None:
@@ -51,6 +61,30 @@ def runs(folder: Path = Path("runs"), /, json: str | None = None) -> None:
     if json != "-":
         runs_table(entries)
     emit_json(entries, json)
+
+
+def report(run: Path, /, out: Path | None = None, robustness: bool = True) -> None:
+    """One page about a run, report.html, that needs no network, and pictures beside it.
+
+    Args:
+        run: a run folder, finished or not, a folder of seeds, a policy or controller file, or
+            acrobot or pendubot for the policy that ships with the package.
+        out: folder for report.html and report/*.png; by default the run folder, or else
+            runs/NAME.
+        robustness: run the robustness benchmark too, seconds for every seed.
+    """
+    from .report import find, unfinished
+    from .terminal import console
+
+    found = find(run)
+    for sentence in unfinished(found):
+        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+    from .page import write
+
+    folder = out or (run if run.is_dir() else Path("runs") / run.stem)
+    page = write(found, folder, title=run.resolve().name, robustness=robustness)
+    line = f"the report is {page}; pictures are in {page.with_suffix('')}"
+    console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def score(robot: str = "pendubot", policy: str | None = None, json: str | None = None) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from .errors import JaxpendError
 
-__all__ = ["listing", "runs_table"]
+__all__ = ["STAGES", "listing", "runs_table", "seed_folders"]
 
 # Stage -> column of the metrics that says how far it is, field of the configuration it goes to.
 STAGES = {"sac": ("env_steps", "steps"), "snes": ("generation", "generations")}
@@ -75,7 +75,7 @@ def _run(folder: Path, name: str) -> dict[str, Any]:
     return about | {"state": "running" if _locked(folder) else "interrupted", "at": at}
 
 
-def _seeds(folder: Path) -> list[Path]:
+def seed_folders(folder: Path) -> list[Path]:
     """The runs of a group of seeds, in the order of the seeds."""
     parts = [path.parent for path in folder.glob("seed*/config.json")]
     return sorted(parts, key=lambda p: (len(p.name), p.name))
@@ -83,7 +83,7 @@ def _seeds(folder: Path) -> list[Path]:
 
 def _group(folder: Path, name: str) -> dict[str, Any]:
     """A group of seeds: its median score, and its runs."""
-    runs = [_run(part, part.name) for part in _seeds(folder)]
+    runs = [_run(part, part.name) for part in seed_folders(folder)]
     scores = [run["score"] for run in runs if run["score"] is not None]
     states = [run["state"] for run in runs]
     worst = next(s for s in ("broken", "running", "interrupted", "finished") if s in states)
@@ -114,7 +114,7 @@ def listing(folder: str | Path) -> list[dict[str, Any]]:
     for path in sorted((p for p in folder.iterdir() if p.is_dir()), key=natural):
         if (path / "config.json").exists():
             entries.append(_run(path, path.name))
-        elif _seeds(path):
+        elif seed_folders(path):
             entries.append(_group(path, path.name))
     if not entries:
         raise JaxpendError(f"there are no runs in {folder}; jaxpend train makes runs")

@@ -20,6 +20,7 @@ from .controllers.saved import load_controller
 from .curves import draw_angles, draw_curves, draw_height, draw_phase, draw_torque, draw_velocities
 from .designs import competition
 from .files import write_atomically
+from .listing import STAGES
 from .report import CURVES, Found, unfinished
 from .robots import active_joint
 from .robustness import CRITERIA, benchmark
@@ -88,13 +89,13 @@ def _curve(run: Found, stage: str, column: str):
         top = max([top, *(score for score in scores if score is not None)])
         y = top if column == "best" else row.get(column)
         if row["stage"] == stage and y is not None:
-            points.append((row[CURVES[stage][0]], y))
+            points.append((row[STAGES[stage][0]], y))
     return np.array([x for x, _ in points]), np.array([y for _, y in points])
 
 
 def _learning(runs: Sequence[Found]) -> Iterator[tuple[str, Any]]:
     """Name of a stage, and a chart: a function of axes. Of several runs, the first column."""
-    for stage, (_, xlabel, _, charts) in CURVES.items():
+    for stage, (xlabel, charts) in CURVES.items():
         for title, columns, ylabel, log in charts:
             shown = list(columns.items())[: 1 if len(runs) > 1 else None]
             curves = {label: [_curve(run, stage, name) for run in runs] for label, name in shown}

@@ -18,8 +18,7 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib.figure import Figure
 
-from .cli import emit_json
-from .files import write_atomically
+from .files import to_json, write_atomically
 from .robustness import CRITERIA
 from .variations import VARIATIONS
 
@@ -252,7 +251,7 @@ def write_robustness(result: dict[str, Any], folder: Path) -> list[Path]:
     """
     robot = result["robot"]
     written = [folder / f"{robot}.json", folder / f"{robot}.csv", folder / "robustness.png"]
-    emit_json(result, written[0])
+    write_atomically(written[0], to_json(result, indent=2) + "\n")
     write_atomically(written[1], _table(result))
     found = [folder / f"{name}.json" for name in ("acrobot", "pendubot")]
     both = [json.loads(path.read_text()) for path in found if path.exists()]

@@ -2,21 +2,20 @@
 
 import dataclasses
 import json
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from .errors import JaxpendError
+from .listing import STAGES, seed_folders
 
-__all__ = ["CURVES", "Found", "find", "main", "unfinished"]
+__all__ = ["CURVES", "Found", "find", "unfinished"]
 
 # Policies of a run, the final one first.
 POLICIES = ("policy.npz", "snes_best.npz", "sac_best.npz")
-# stage -> column on x, its name, what it counts up to, and the charts:
-# title, label -> column, label on y, logarithmic.
+# Stage -> what is on x, and the charts: title, label -> column, label on y, logarithmic.
 CURVES = {
-    "sac": ("env_steps", "environment steps", "steps", (
+    "sac": ("environment steps", (
         ("Official score", {"best so far": "best", "now": "score"}, "v2 score", False),
         ("Reward", {"reward": "reward"}, "mean of a step", False),
         ("Temperature", {"temperature": "temperature"}, "", True),
@@ -24,7 +23,7 @@ CURVES = {
         ("Loss of the critics", {"loss": "critic_loss"}, "", True),
         ("Loss of the actor", {"loss": "actor_loss"}, "", False),
     )),
-    "snes": ("generation", "generations", "generations", (
+    "snes": ("generations", (
         ("Fitness", {"mean": "mean_fitness", "best": "max_fitness"}, "noisy v2 score", False),
         ("Official score", {"best so far": "best", "mean": "mean_score"}, "v2 score", False),
         ("Standard deviation", {"sigma": "sigma"}, "of the parameters", False),
@@ -47,7 +46,7 @@ class Found:
     def stages(self) -> dict[str, tuple[int, int]]:
         """Stage -> how far it is, and how far it is to go. The last chunk may go beyond."""
         done = {}
-        for stage, (column, _, total, _) in CURVES.items():
+        for stage, (column, total) in STAGES.items():
             if stage in self.config:
                 steps = [row[column] for row in self.rows if row["stage"] == stage]
                 goal = self.config[stage][total]
@@ -68,7 +67,7 @@ def _rows(path: Path) -> list[dict]:
     for line in path.read_text().splitlines() if path.exists() else ():
         try:
             row = json.loads(line)
-            rows[row["stage"], row[CURVES[row["stage"]][0]]] = row
+            rows[row["stage"], row[STAGES[row["stage"]][0]]] = row
         except (ValueError, KeyError, TypeError):
             continue
     return [rows[key] for key in sorted(rows, key=lambda key: (key[0], key[1]))]
@@ -99,11 +98,7 @@ def find(run: Path) -> list[Found]:
     from .controllers.policy import read_header
     from .robots import ROBOTS
 
-    seeds = sorted(
-        (p.parent for p in run.glob("seed*/config.json")),
-        key=lambda p: (int((re.findall(r"\d+", p.name) or ["0"])[0]), p.name),
-    )
-    if seeds:
+    if seeds := seed_folders(run):
         return [_run(seed) for seed in seeds]
     if (run / "config.json").exists():
         return [_run(run)]
@@ -121,37 +116,14 @@ def unfinished(runs: Sequence[Found]) -> list[str]:
     for run in runs:
         if run.config and run.result is None:
             where = [
-                f"{stage.upper()} is at {done:,} of {total:,} {CURVES[stage][1]}"
+                f"{stage.upper()} is at {done:,} of {total:,} {CURVES[stage][0]}"
                 for stage, (done, total) in run.stages.items()
             ]
             sentences.append(f"{run.name} is not finished: {', '.join(where)}.")
     return sentences
 
 
-def main(run: Path, /, out: Path | None = None, robustness: bool = True) -> None:
-    """One page about a run, report.html, that needs no network, and pictures beside it.
-
-    Args:
-        run: a run folder, a folder of seeds, a policy file, or acrobot or pendubot for the
-            policy that ships with the package. A run that is not finished shows what is there.
-        out: folder for report.html and report/*.png; by default the run folder, or else
-            runs/NAME.
-        robustness: False leaves the robustness benchmark out, which takes seconds a seed.
-    """
-    from .terminal import console
-
-    runs = find(run)
-    for sentence in unfinished(runs):
-        console.print(sentence, highlight=False, soft_wrap=True)
-    from .page import write
-
-    folder = out or (run if run.is_dir() else Path("runs") / run.stem)
-    page = write(runs, folder, title=run.resolve().name, robustness=robustness)
-    line = f"the report is [bold]{page}[/bold]; pictures are in {page.with_suffix('')}"
-    console.print(line, highlight=False, soft_wrap=True)
-
-
 if __name__ == "__main__":
-    from .cli import run
+    from .cli import main
 
-    run(main, "jaxpend.report")
+    main("report")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxpend import cli, load_policy, page, report, save_policy
+from jaxpend import cli, commands, load_policy, page, report, save_policy
 from jaxpend.config import TrainRun
 from jaxpend.curves import _goals, _turns
 from jaxpend.designs import competition
@@ -135,7 +135,7 @@ def test_a_run_that_is_not_finished_shows_what_is_there(tmp_path, capsys):
     folder = make_run(tmp_path / "half", [sac(0, 0.1)], policy="sac_best.npz", result=False)
     with (folder / "metrics.jsonl").open("a") as file:
         file.write('{"stage": "sac", "env_steps": 50')
-    report.main(folder, robustness=False)
+    commands.report(folder, robustness=False)
     text = (folder / "report.html").read_text()
     words = "half is not finished: SAC is at 0 of 600,000 environment steps, SNES is at 0 of 400"
     assert words in text
@@ -146,7 +146,7 @@ def test_a_run_that_is_not_finished_shows_what_is_there(tmp_path, capsys):
 
 def test_a_run_without_a_policy_has_a_page_too(tmp_path):
     folder = make_run(tmp_path / "young", [], policy=None, result=False)
-    report.main(folder)
+    commands.report(folder)
     text = (folder / "report.html").read_text()
     assert "there is no policy yet" in text
     assert "<canvas" not in text
@@ -200,7 +200,7 @@ def test_policies_can_be_shown_without_a_run(tmp_path, monkeypatch):
     save_policy(tmp_path / "mine.npz", load_policy("pendubot"))
     (own,) = report.find(Path("mine.npz"))
     assert (own.robot, own.name) == ("pendubot", "mine")
-    report.main(Path("mine.npz"), robustness=False)
+    commands.report(Path("mine.npz"), robustness=False)
     assert "Learning" not in (tmp_path / "runs" / "mine" / "report.html").read_text()
 
 
@@ -222,9 +222,9 @@ def test_what_is_not_a_run_is_one_sentence(tmp_path, monkeypatch, capsys, prepar
     monkeypatch.chdir(tmp_path)
     prepare(tmp_path / "thing")
     before = sorted(tmp_path.rglob("*"))
-    monkeypatch.setattr("sys.argv", ["report", "thing"])
+    monkeypatch.setattr("sys.argv", ["jaxpend", "report", "thing"])
     with pytest.raises(SystemExit) as stop:
-        cli.run(report.main, "jaxpend.report")
+        cli.main()
     assert stop.value.code == 2
     message = capsys.readouterr().err.strip()
     assert words in message
