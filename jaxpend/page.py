@@ -97,7 +97,10 @@ def _learning(runs: Sequence[Found]) -> Iterator[tuple[str, Any]]:
     """Name of a stage, and a chart: a function of axes. Of several runs, the first column."""
     for stage, (xlabel, charts) in CURVES.items():
         for title, columns, ylabel, log in charts:
-            shown = list(columns.items())[: 1 if len(runs) > 1 else None]
+            shown = list(columns.items())
+            if len(runs) > 1:
+                title += f", {shown[0][0]}" * (len(shown) > 1)
+                shown = shown[:1]
             curves = {label: [_curve(run, stage, name) for run in runs] for label, name in shown}
             curves = {k: v for k, v in curves.items() if any(len(x) for x, _ in v)}
             if curves:
