@@ -13,7 +13,7 @@ $(error ROBOT is '$(ROBOT)'; it must be acrobot or pendubot)
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help install train snes score robustness leaderboard runs test lint bench clean
+.PHONY: help install train snes score robustness leaderboard runs report test lint bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -47,6 +47,9 @@ leaderboard: $(STAMP)  ## every known controller on both boards, next to the pub
 
 runs: $(STAMP)  ## list the runs with their state and scores
 	$(BIN)/jaxpend runs $(ARGS)
+
+report: $(STAMP)  ## one page about the run RUN, with pictures
+	$(BIN)/jaxpend report runs/$(RUN) $(ARGS)
 
 test: $(STAMP)  ## the test suite
 	$(BIN)/python -m pytest $(ARGS)
