@@ -42,6 +42,9 @@ def _progress(folder: Path, config: Mapping) -> tuple[str, float | None]:
     for line in reversed(_lines(folder / "metrics.jsonl")):
         with contextlib.suppress(ValueError, KeyError, TypeError):  # what a crash cut off
             row = json.loads(line)
+            if row["stage"] == "imitation":
+                at, of = row["updates"], config["sac"]["demonstrations"]["updates"]
+                return f"imitation {at:,}/{of:,}", row.get("seconds")
             column, total = STAGES[row["stage"]]
             of = config[row["stage"]][total]
             return f"{row['stage'].upper()} {row[column]:,}/{of:,}", row.get("seconds")

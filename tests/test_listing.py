@@ -10,7 +10,10 @@ import pytest
 from jaxpend import JaxpendError, cli
 from jaxpend.listing import listing
 
-CONFIG = {"robot": "acrobot", "seed": 3, "sac": {"steps": 100}, "snes": {"generations": 1000}}
+CONFIG = {
+    "robot": "acrobot", "seed": 3, "snes": {"generations": 1000},
+    "sac": {"steps": 100, "demonstrations": {"updates": 4000}},
+}  # fmt: skip
 
 
 def make(folder, rows=(), result=None, config=CONFIG):
@@ -35,6 +38,7 @@ def runs(tmp_path):
     """A folder with a run in every state, and things that are none."""
     make(tmp_path / "done", SNES, {"score": 0.5})
     make(tmp_path / "half", SAC[:1])
+    make(tmp_path / "imitates", [{"stage": "imitation", "seconds": 1.0, "updates": 2000}])
     make(tmp_path / "new", config={"robot": "pendubot", "seed": 0, "snes": {"generations": 3}})
     cut = make(tmp_path / "cut", SNES)
     with (cut / "metrics.jsonl").open("a") as file:
@@ -57,6 +61,7 @@ def test_every_state_is_told_apart(runs):
         "done": ("finished", None, 0.5),
         "foreign": ("broken", "config.json", None),
         "half": ("interrupted", "SAC 50/100", None),
+        "imitates": ("interrupted", "imitation 2,000/4,000", None),
         "new": ("interrupted", "the start", None),
     }
     done = entries["done"]
