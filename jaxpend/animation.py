@@ -95,7 +95,9 @@ def gif(path: Path, t, x, length, *, end: float, size: int = 320, rate: int = 25
         _frame(points[k], points[max(k - back, 0) : k + 1 : 5, 1], length, t[k], size)
         for k in picked[picked < len(t)]
     ]
-    palette = images[len(images) // 2].quantize(48)
+    # One palette of all the colours there are, from pictures with and without each of them.
+    some = [np.asarray(images[k]) for k in (0, len(images) // 2, -1)]
+    palette = Image.fromarray(np.concatenate(some)).quantize(64)
     frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     # The last picture stays for a second, so that an eye can tell where the film begins.
     durations = [1000 // rate] * (len(frames) - 1) + [1000]

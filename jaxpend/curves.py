@@ -32,11 +32,12 @@ def _turns(value: float, _position: int = 0) -> str:
 
 
 def _angle_axis(axis, values: np.ndarray) -> None:
-    """Ticks every half turn, or wider where the arm went round and round."""
+    """Ticks at half turns, turns, or less often where the arm went round and round."""
     turns = (values.max() - values.min()) / np.pi
-    step = next((s for s in (0.5, 1, 2, 4, 10, 20, 40) if turns / s <= 6), 100)
-    axis.set_major_locator(MultipleLocator(step * np.pi))
-    axis.set_major_formatter(FuncFormatter(_turns))
+    steps = [s for s in (0.5, 1, 2, 4, 10, 20, 40, 100, 200) if turns / s <= 6]
+    if steps:
+        axis.set_major_locator(MultipleLocator(steps[0] * np.pi))
+        axis.set_major_formatter(FuncFormatter(_turns))
 
 
 def _legend(axes) -> None:

@@ -66,13 +66,15 @@ def judge(found: Found, robustness: bool = True) -> Judged | None:
         policy = load_controller(found.policy, robot=found.robot)
         nominal = competition(found.robot)
         report = benchmark(policy, nominal, jax.random.key(0)).as_dict()
+    x = np.asarray(run.x)
+    whole = np.isfinite(x).all(axis=1).cumprod().sum()  # samples until it diverged, if it did
     return Judged(
         score=score,
         criteria={name: float(value) for name, value in vars(c).items() if name != "success"},
         success=bool(c.success),
-        t=np.asarray(run.t),
-        x=np.asarray(run.x),
-        u=np.asarray(run.u),
+        t=np.asarray(run.t)[:whole],
+        x=x[:whole],
+        u=np.asarray(run.u)[: whole - 1],
         header=read_header(found.policy),
         robustness=report and {"robot": found.robot} | report,
     )
@@ -130,6 +132,7 @@ def _window(judged: Judged) -> float:
 def _criteria(judged: Judged) -> list[dict]:
     """The five criteria of the score, and what each costs of it."""
     share = {n: math.tanh(math.pi * judged.criteria[n] / norm) for n, norm in V2_OFFICIAL.items()}
+    share = {n: value if math.isfinite(value) else 1.0 for n, value in share.items()}
     return [
         {
             "title": title,

@@ -15,7 +15,6 @@ from PIL import Image
 
 from jaxpend import cli, commands, load_policy, page, report, save_policy
 from jaxpend.config import TrainRun
-from jaxpend.curves import _goals, _turns
 from jaxpend.designs import competition
 from jaxpend.robustness import benchmark, strips
 from jaxpend.runs import to_mapping
@@ -232,12 +231,16 @@ def test_what_is_not_a_run_is_one_sentence(tmp_path, monkeypatch, capsys, prepar
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_angles_are_shown_in_half_turns_and_goals_where_the_arm_ended():
-    assert [_turns(k * np.pi / 2) for k in (-3, -2, -1, 0, 1, 2, 4)] == [
-        "\N{MINUS SIGN}3π/2", "\N{MINUS SIGN}π", "\N{MINUS SIGN}π/2", "0", "π/2", "π", "2π",
-    ]  # fmt: skip
-    assert _goals(np.array([[-3.0, 6.2, 0, 0]])) == (-np.pi, 2 * np.pi)
-    assert _goals(np.array([[3.3, 0.1, 0, 0]])) == (np.pi, 0)
+def test_a_policy_that_fails_is_shown_failing(tmp_path):
+    shipped = load_policy("pendubot")
+    *hidden, (kernel, bias) = shipped.layers
+    pushing = shipped.replace(layers=(*hidden, (0 * kernel, bias + 20)))
+    save_policy(tmp_path / "push.npz", pushing)
+    commands.report(tmp_path / "push.npz", out=tmp_path, robustness=False)
+    text = (tmp_path / "report.html").read_text()
+    assert "<dd>0.0000</dd>" in text
+    assert "not above the 0.9 line at the end" in text
+    assert "The first 10 s" in text
 
 
 # --- in a browser --------------------------------------------------------------------------
