@@ -73,11 +73,11 @@ def report(run: Path, /, out: Path | None = None, robustness: bool = True) -> No
             runs/NAME.
         robustness: run the robustness benchmark too, seconds for every seed.
     """
-    from .report import find, unfinished
+    from .report import find, remarks
     from .terminal import console
 
     found = find(run)
-    for sentence in unfinished(found):
+    for sentence in remarks(found):
         console.print(sentence, highlight=False, markup=False, soft_wrap=True)
     from .page import write
 

@@ -20,8 +20,7 @@ from .controllers.saved import load_controller
 from .curves import draw_angles, draw_curves, draw_height, draw_phase, draw_torque, draw_velocities
 from .designs import competition
 from .files import write_atomically
-from .listing import STAGES
-from .report import CURVES, Found, unfinished
+from .report import CURVES, Found, remarks
 from .robots import active_joint
 from .robustness import CRITERIA, benchmark
 from .runs import to_mapping
@@ -86,24 +85,25 @@ def _curve(run: Found, stage: str, column: str):
     The column "best" is the best official score so far, those of earlier stages included.
     """
     order, top, points = list(CURVES), -math.inf, []
-    for row in sorted(run.rows, key=lambda row: order.index(row["stage"])):
+    good = [row for row in run.rows if row.get("finite") != 0]
+    for row in sorted(good, key=lambda row: order.index(row["stage"])):
         scores = (row.get(k) for k in ("score", "mean_score", "individual_score"))
         top = max([top, *(score for score in scores if score is not None)])
         y = top if column == "best" else row.get(column)
         if row["stage"] == stage and y is not None:
-            points.append((row[STAGES[stage][0]], y))
+            points.append((row[CURVES[stage][1]], y))
     return np.array([x for x, _ in points]), np.array([y for _, y in points])
 
 
 def _learning(runs: Sequence[Found]) -> Iterator[tuple[str, Any]]:
     """Name of a stage, and a chart: a function of axes. Of several runs, the first column."""
-    for stage, (xlabel, charts) in CURVES.items():
+    for key, (stage, _, xlabel, charts) in CURVES.items():
         for title, columns, ylabel, log in charts:
             shown = list(columns.items())
             if len(runs) > 1:
                 title += f", {shown[0][0]}" * (len(shown) > 1)
                 shown = shown[:1]
-            curves = {label: [_curve(run, stage, name) for run in runs] for label, name in shown}
+            curves = {label: [_curve(run, key, name) for run in runs] for label, name in shown}
             curves = {k: v for k, v in curves.items() if any(len(x) for x, _ in v)}
             if curves:
                 options = {"xlabel": xlabel, "ylabel": ylabel, "log": log}
@@ -267,6 +267,7 @@ def write(runs: Sequence[Found], folder: Path, *, title: str, robustness: bool =
     judged = [judge(run, robustness) for run in runs]
     rows = _seed_table(runs, judged)
     shown = max((k for k, j in enumerate(judged) if j), key=lambda k: judged[k].score, default=None)
+    made_by = runs[0].made_by or (judged[shown].header["provenance"] if shown is not None else {})
     learning = list(_learning(runs))
     if learning:
         sheet = plots.stack([draw for _, draw in learning], columns=3, title=f"{robot}, {title}")
@@ -274,10 +275,12 @@ def write(runs: Sequence[Found], folder: Path, *, title: str, robustness: bool =
     context = {
         "title": title,
         "robot": robot,
-        "unfinished": unfinished(runs),
+        "remarks": remarks(runs),
         "seeds": rows if len(runs) > 1 else [],
         "config": [{"name": n, "value": v, "default": d} for n, v, d in _changed(runs[0].config)],
         "whole_config": _flat(runs[0].config),
+        "made_by": made_by,
+        "finished": all(run.result or not run.config for run in runs),
         "versions": {"jaxpend": __version__, "jax": jax.__version__, "numpy": np.__version__},
         "stages": _stages(runs[0]) if len(runs) == 1 else {},
         "learning": [

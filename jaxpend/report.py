@@ -9,13 +9,17 @@ from typing import Any
 from .errors import JaxpendError
 from .listing import STAGES, seed_folders
 
-__all__ = ["CURVES", "Found", "find", "unfinished"]
+__all__ = ["CURVES", "Found", "find", "remarks"]
 
 # Policies of a run, the final one first.
 POLICIES = ("policy.npz", "snes_best.npz", "sac_best.npz")
-# Stage -> what is on x, and the charts: title, label -> column, label on y, logarithmic.
+# Stage -> its title, the column on x, what that is, and the charts: title, label -> column,
+# label on y, logarithmic.
 CURVES = {
-    "sac": ("environment steps", (
+    "imitation": ("Imitation", "updates", "updates", (
+        ("Squared error", {"loss": "loss"}, "of the action", True),
+    )),
+    "sac": ("SAC", "env_steps", "environment steps", (
         ("Official score", {"best so far": "best", "now": "score"}, "v2 score", False),
         ("Reward", {"reward": "reward"}, "mean of a step", False),
         ("Temperature", {"temperature": "temperature"}, "", True),
@@ -23,7 +27,7 @@ CURVES = {
         ("Loss of the critics", {"loss": "critic_loss"}, "", True),
         ("Loss of the actor", {"loss": "actor_loss"}, "", False),
     )),
-    "snes": ("generations", (
+    "snes": ("SNES", "generation", "generations", (
         ("Fitness", {"mean": "mean_fitness", "best": "max_fitness"}, "noisy v2 score", False),
         ("Official score", {"best so far": "best", "mean": "mean_score"}, "v2 score", False),
         ("Standard deviation", {"sigma": "sigma"}, "of the parameters", False),
@@ -41,16 +45,19 @@ class Found:
     rows: list[dict]  # of metrics.jsonl, in order
     result: dict | None  # None: not finished
     policy: str | None  # path, or robot for what ships with the package; None: none yet
+    made_by: dict = dataclasses.field(default_factory=dict)  # command and version
 
     @property
     def stages(self) -> dict[str, tuple[int, int]]:
         """Stage -> how far it is, and how far it is to go. The last chunk may go beyond."""
+        goals = {s: self.config[s][total] for s, (_, total) in STAGES.items() if s in self.config}
+        demonstrations = self.config.get("sac", {}).get("demonstrations", {})
+        if demonstrations.get("episodes"):
+            goals = {"imitation": demonstrations["updates"], **goals}
         done = {}
-        for stage, (column, total) in STAGES.items():
-            if stage in self.config:
-                steps = [row[column] for row in self.rows if row["stage"] == stage]
-                goal = self.config[stage][total]
-                done[stage] = (min(max(steps, default=0), goal), goal)
+        for stage, goal in goals.items():
+            steps = [row[CURVES[stage][1]] for row in self.rows if row["stage"] == stage]
+            done[stage] = (min(max(steps, default=0), goal), goal)
         return done
 
 
@@ -67,7 +74,7 @@ def _rows(path: Path) -> list[dict]:
     for line in path.read_text().splitlines() if path.exists() else ():
         try:
             row = json.loads(line)
-            rows[row["stage"], row[STAGES[row["stage"]][0]]] = row
+            rows[row["stage"], row[CURVES[row["stage"]][1]]] = row
         except (ValueError, KeyError, TypeError):
             continue
     return [rows[key] for key in sorted(rows, key=lambda key: (key[0], key[1]))]
@@ -85,6 +92,7 @@ def _run(folder: Path) -> Found:
         rows=_rows(folder / "metrics.jsonl"),
         result=_json(result) if result.exists() else None,
         policy=next((str(folder / n) for n in POLICIES if (folder / n).exists()), None),
+        made_by=_json(folder / "run.json") if (folder / "run.json").exists() else {},
     )
 
 
@@ -110,16 +118,20 @@ def find(run: Path) -> list[Found]:
     )
 
 
-def unfinished(runs: Sequence[Found]) -> list[str]:
-    """What is not finished, a sentence each."""
+def remarks(runs: Sequence[Found]) -> list[str]:
+    """What is not finished, or went wrong on the way, a sentence each."""
     sentences = []
     for run in runs:
         if run.config and run.result is None:
-            where = [
-                f"{stage.upper()} is at {done:,} of {total:,} {CURVES[stage][0]}"
+            where = ", ".join(
+                f"{CURVES[stage][0]} is at {done:,} of {total:,} {CURVES[stage][2]}"
                 for stage, (done, total) in run.stages.items()
-            ]
-            sentences.append(f"{run.name} is not finished: {', '.join(where)}.")
+            )
+            diverged = any(row.get("finite") == 0 for row in run.rows)
+            sentences.append(f"{run.name} is not finished{' and diverged' * diverged}: {where}.")
+        if back := max((row.get("rollbacks", 0) for row in run.rows), default=0):
+            times = f"{back} time{'s' * (back > 1)}"
+            sentences.append(f"{run.name} diverged and went back to its last good state {times}.")
     return sentences
 
 

@@ -182,6 +182,26 @@ def test_curves_know_the_best_so_far_through_all_stages(made):
     ]
 
 
+def test_what_went_wrong_is_said(tmp_path):
+    rows = [{"stage": "imitation", "updates": 20, "loss": 0.1}, sac(0, 0.2)]
+    rows += [sac(25, 0.9, finite=0, rollbacks=1), sac(50, 0.1, rollbacks=1)]
+    folder = make_run(tmp_path / "hard", rows, result=False)
+    config = json.loads((folder / "config.json").read_text())
+    config["sac"]["demonstrations"] |= {"episodes": 3, "updates": 20}
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "run.json").write_text('{"command": "jaxpend train --seed 5", "version": "0.9"}')
+    (run,) = report.find(folder)
+    first, second = report.remarks([run])
+    assert first.startswith(
+        "hard is not finished and diverged: Imitation is at 20 of 20 updates, S"
+    )
+    assert second == "hard diverged and went back to its last good state 1 time."
+    # What diverged is no best score.
+    assert page._curve(run, "sac", "best")[1].tolist() == [0.2, 0.2]
+    assert page._curve(run, "imitation", "loss")[1].tolist() == [0.1]
+    assert run.made_by["command"] == "jaxpend train --seed 5"
+
+
 def test_rows_that_came_twice_count_once_in_order(tmp_path):
     rows = [sac(50, 0.1), sac(25, 0.2), sac(50, 0.3), {"stage": "else"}, ["no row"]]
     folder = make_run(tmp_path / "resumed", rows)
