@@ -2,22 +2,28 @@
 
     python experiments/bench.py            # or: make bench
     python experiments/bench.py --parts mpc
+    python experiments/bench.py --parts seeds
 
 Compile and run times are given apart; every figure is the median of five runs, of MPC one run.
 """
 
 import argparse
+import dataclasses
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxpend import Scenario, designs, sac, snes
+from jaxpend.config import TrainRun
 from jaxpend.controllers import Policy
 from jaxpend.controllers.known import build
 from jaxpend.observation import Observation
+from jaxpend.runs import load_config
 from jaxpend.score import performance, score_v2
+from jaxpend.stages import SAC, SNES
 
 
 def random_policy(width: int) -> Policy:
@@ -46,6 +52,30 @@ def timed(f, *args, runs: int = 5) -> tuple[float, float]:
 def show(name: str, compile_time: float, seconds: float, speed: str = "") -> None:
     """A line of the table."""
     print(f"{name:44s}{compile_time:12.2f}{seconds:10.3f}  {speed}".rstrip(), flush=True)
+
+
+def bench_seeds(count: int = 4) -> None:
+    """What a vmap over seeds brings: the recipe of the pendubot, chunks as in training."""
+    recipe = load_config(TrainRun(), Path(__file__).parent / "pendubot.yaml")
+    # Imitation is not timed, and what is learned does not matter: few demonstrations will do.
+    shown = dataclasses.replace(recipe.sac.demonstrations, episodes=20, updates=1)
+    config = dataclasses.replace(recipe.sac, demonstrations=shown, actor_delay=0)
+    search = SNES(recipe.snes, random_policy(64))
+    training = SAC(config)
+    keys = [jax.random.key(seed) for seed in range(count)]
+    parts = {
+        "SAC": (training, [sac.init(config, key) for key in keys]),
+        "SNES": (search, [search.start(seed, random_policy(64)) for seed in range(count)]),
+    }
+    for name, (stage, states) in parts.items():
+        loop = lambda stage=stage, states=states: [stage.advance([s]) for s in states]  # noqa: E731
+        vmap = lambda stage=stage, states=states: stage.advance(states)  # noqa: E731
+        times = []
+        for how, f in (("one after another", loop), ("vmap", vmap)):
+            compile_time, run = timed(f)
+            times.append(run)
+            speed = f"({times[0] / run:.2f} x as fast)"
+            show(f"{name}: a chunk of {count} seeds, {how}", compile_time, run, speed)
 
 
 def rollouts(controller, robot: str, name: str, batches, runs: int = 5) -> None:
@@ -84,7 +114,7 @@ def bench_sac() -> None:
     vector_steps = 250
 
     def chunk():
-        nonlocal state  # its buffers are donated
+        nonlocal state
         state, metrics = sac.train_chunk(config, state, vector_steps)
         return metrics
 
@@ -106,13 +136,16 @@ def bench_snes() -> None:
         show(f"SNES: a generation of 40, {scenarios} scenarios, 2x64", compile_time, seconds / 2)
 
 
-PARTS = {"rollouts": bench_rollouts, "mpc": bench_mpc, "sac": bench_sac, "snes": bench_snes}
+PARTS = {
+    "rollouts": bench_rollouts, "mpc": bench_mpc, "sac": bench_sac, "snes": bench_snes,
+    "seeds": bench_seeds,
+}  # fmt: skip
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    quick = [name for name in PARTS if name != "mpc"]
+    quick = [name for name in PARTS if name not in ("mpc", "seeds")]
     parser.add_argument("--parts", nargs="+", default=quick, choices=PARTS)
     parts = parser.parse_args().parts
     print(f"jax {jax.__version__}, {jax.devices()[0].device_kind}, {jax.device_count()} device(s)")

@@ -12,6 +12,7 @@ from .observation import Observation
 from .robots import active_joint
 
 __all__ = [
+    "CheckpointConfig",
     "DemonstrationConfig",
     "EnvConfig",
     "Reward",
@@ -182,17 +183,38 @@ class SNESConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class CheckpointConfig:
+    """When training is put on disk, besides at the end of a stage and where it is stopped."""
+
+    every: float = 60.0  # s
+    keep: int = 2  # the newest so many
+
+    def __post_init__(self):
+        if not (self.every >= 0 and self.keep >= 1):
+            raise JaxpendError("checkpoint: every must not be negative, keep must be positive")
+
+
+@dataclasses.dataclass(frozen=True)
 class Run:
     """What every training run has."""
 
     robot: str = "pendubot"
     seed: int = 0
+    seeds: int = 1  # how many runs, of the seeds from ``seed`` on, each in RUN/seedN
+    vmap: str = "auto"  # several seeds in one computation: yes, no, or on an accelerator
     run: str = ""  # name of the run folder; empty: ROBOT-seedSEED, or ROBOT-snes-seedSEED
     runs: str = "runs"  # folder of the run folders
+    checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
+    on_divergence: str = "stop"  # or "rollback": back to the last chunk, on with another key
+    max_rollbacks: int = 3  # in a run, before it stops after all
     tensorboard: bool = False  # the metrics as TensorBoard events too, in RUN/tensorboard
 
     def __post_init__(self):
         active_joint(self.robot)
+        choose("choice of vmap", self.vmap, ("auto", "yes", "no"))
+        choose("choice of on_divergence", self.on_divergence, ("stop", "rollback"))
+        if self.seeds < 1:
+            raise JaxpendError(f"seeds is {self.seeds}; it must be positive")
         if hasattr(self, "sac"):
             changed = self.sac.for_robot(self.robot)
             object.__setattr__(self, "sac", changed)
@@ -202,7 +224,15 @@ class Run:
         """Path of the run folder."""
         # A stage alone must not land in the folder of the whole run that it may start from.
         stage = {SACRun: "-sac", SNESRun: "-snes"}.get(type(self), "")
-        return Path(self.runs) / (self.run or f"{self.robot}{stage}-seed{self.seed}")
+        seeds = f"s{self.seed}-{self.seed + self.seeds - 1}" if self.seeds > 1 else str(self.seed)
+        return Path(self.runs) / (self.run or f"{self.robot}{stage}-seed{seeds}")
+
+    def of_seeds(self) -> list["Run"]:
+        """A configuration for each seed; of several, each has a folder in ``folder``."""
+        if self.seeds == 1:
+            return [self]
+        numbers, name = range(self.seed, self.seed + self.seeds), self.folder.name
+        return [dataclasses.replace(self, seeds=1, seed=n, run=f"{name}/seed{n}") for n in numbers]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,18 +15,17 @@ import numpy as np
 import optax
 
 from . import designs
+from ._struct import pytree
 from .config import DemonstrationConfig
 from .controllers.base import Controller
 from .env import DoublePendulum
 from .errors import JaxpendError
-from .interrupt import stop_if_asked
 from .networks import Actor
 from .scenario import random_pulses
 
-__all__ = ["DemonstrationConfig", "collect", "imitate", "swingups"]
+__all__ = ["DemonstrationConfig", "Imitation", "collect", "imitate", "imitation", "swingups"]
 
 SATURATED = 0.99  # of the torque limit
-CHUNK = 2000  # imitation updates in one compiled call
 
 
 def collect(
@@ -92,50 +91,57 @@ def swingups(
     return collect(config, env, controller, key, reward_scale=reward_scale)
 
 
-def imitate(
-    config: DemonstrationConfig,
-    actor: Actor,
-    observe: Callable,
-    params: dict,
-    rows: jax.Array,
-    wanted: jax.Array,
-    key: jax.Array,
-) -> tuple[dict, jax.Array]:
-    """Fit the actor's greedy action to the wanted ones; returns parameters and the last losses.
+@pytree
+class Imitation:
+    """An actor on its way to the demonstrated actions."""
 
-    Minimises the mean squared error of tanh(mean). ``observe`` maps a state (4,) and the previous
-    action () to an observation. ``key`` is consumed.
-    """
-    obs = jax.jit(jax.vmap(observe))(rows[:, :4], rows[:, 4])
-    opt_state, errors = _adam(config).init(params), []
-    keys = jax.random.split(key, config.updates)
-    for first in range(0, config.updates, CHUNK):
-        stop_if_asked()
-        now = keys[first : first + CHUNK]
-        params, opt_state, error = _fit(config, actor, params, opt_state, obs, wanted, now)
-        errors.append(error)
-    return params, jnp.concatenate(errors)[-100:].mean()
+    params: dict
+    opt_state: optax.OptState
+    key: jax.Array  # the same all the way: an update's key depends on its number alone
+    done: jax.Array  # () int, updates
 
 
 def _adam(config: DemonstrationConfig) -> optax.GradientTransformation:
     return optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.updates, 1e-3))
 
 
-@partial(jax.jit, static_argnames=("config", "actor"))
-def _fit(config, actor, params, opt_state, obs, wanted, keys):
-    """An update for each key; returns parameters, optimiser state and losses."""
+def imitation(config: DemonstrationConfig, params: dict, key: jax.Array) -> Imitation:
+    """Before the first update. ``key`` is consumed."""
+    return Imitation(params, _adam(config).init(params), key, jnp.zeros((), jnp.int32))
+
+
+@partial(jax.jit, static_argnames=("config", "actor", "observe", "updates"))
+def imitate(
+    config: DemonstrationConfig,
+    actor: Actor,
+    observe: Callable,
+    state: Imitation,
+    rows: jax.Array,
+    wanted: jax.Array,
+    updates: int,
+    count: jax.Array | int | None = None,
+) -> tuple[Imitation, jax.Array]:
+    """Fit the actor's greedy action to the wanted ones; returns the state and losses (updates,).
+
+    Minimises the mean squared error of tanh(mean). ``observe`` maps a state (4,) and the previous
+    action () to an observation. ``count`` is the number of rows, if they are not all filled.
+    """
+    count = len(rows) if count is None else count
+    obs = jax.vmap(observe)(rows[:, :4], rows[:, 4])
+    keys = jax.random.split(state.key, config.updates)
 
     def step(carry, key):
         params, opt_state = carry
-        index = jax.random.randint(key, (config.batch_size,), 0, obs.shape[0])
+        index = jax.random.randint(key, (config.batch_size,), 0, count)
 
         def loss(params):
             mean, _ = actor.apply(params, obs[index])
             return jnp.mean((jnp.tanh(mean[:, 0]) - wanted[index]) ** 2)
 
         error, grads = jax.value_and_grad(loss)(params)
-        updates, opt_state = _adam(config).update(grads, opt_state)
-        return (optax.apply_updates(params, updates), opt_state), error
+        change, opt_state = _adam(config).update(grads, opt_state)
+        return (optax.apply_updates(params, change), opt_state), error
 
-    (params, opt_state), errors = jax.lax.scan(step, (params, opt_state), keys)
-    return params, opt_state, errors
+    now = jax.lax.dynamic_slice_in_dim(keys, state.done, updates)
+    (params, opt_state), errors = jax.lax.scan(step, (state.params, state.opt_state), now)
+    return state.replace(params=params, opt_state=opt_state, done=state.done + updates), errors

@@ -5,6 +5,7 @@ each followed by gradient updates. Episodes are truncated, never terminated: eve
 bootstraps from the true next state.
 """
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -14,7 +15,7 @@ import optax
 from ._struct import pytree
 from .config import SACConfig
 from .controllers.policy import Policy
-from .demonstrations import imitate, swingups
+from .demonstrations import Imitation, imitate, imitation, swingups
 from .env import DoublePendulum
 from .networks import Actor, TwinCritic, constant_log_std, sample_action, to_policy
 
@@ -34,6 +35,14 @@ class Replay:
 
 
 @pytree
+class Demonstrations:
+    """Rows of demonstrations; as many as there could be, so that all seeds compile the same."""
+
+    rows: jax.Array  # (capacity, ROW + 1) replay rows and wanted actions, then zeros
+    size: jax.Array  # () int, rows filled
+
+
+@pytree
 class SACState:
     """Everything that training changes."""
 
@@ -45,7 +54,7 @@ class SACState:
     critic_opt: optax.OptState
     temperature_opt: optax.OptState
     replay: Replay
-    demonstrations: jax.Array | None  # (m, ROW + 1), replay rows and wanted actions
+    demonstrations: Demonstrations | None
     env_x: dict  # brax State, batched over environments
     env_time: jax.Array  # (num_envs,) int, steps into the episode
     key: jax.Array
@@ -75,16 +84,51 @@ def init(config: SACConfig, key: jax.Array) -> SACState:
     half of every batch is drawn from its demonstrations (Ball et al., "Efficient online
     reinforcement learning with offline data", 2023). ``key`` is consumed.
     """
+    state, learner = begin(config, key)
+    if learner is None:
+        return state
+    learner, _ = imitate_chunk(config, state, learner, config.demonstrations.updates)
+    return state.replace(actor=learner.params)
+
+
+def begin(config: SACConfig, key: jax.Array) -> tuple[SACState, Imitation | None]:
+    """``init`` before imitation, and the imitation that is to be done with ``imitate_chunk``."""
     key, key_demonstrate, key_imitate = jax.random.split(key, 3)
     state, recipe = _fresh(config, key), config.demonstrations
     if not recipe.episodes:
-        return state
-    env, (actor, _) = DoublePendulum(config.env), networks(config)
+        return state, None
+    env = DoublePendulum(config.env)
     rows, wanted = swingups(recipe, env, key_demonstrate, reward_scale=config.reward_scale)
+    size = jnp.asarray(len(rows), jnp.int32)
+    missing = recipe.episodes * round(recipe.duration / config.env.dt) - len(rows)
+    rows = jnp.pad(jnp.concatenate([rows, wanted[:, None]], axis=1), ((0, missing), (0, 0)))
     params = constant_log_std(state.actor, recipe.log_std)
-    params, _ = imitate(recipe, actor, env.observe, params, rows, wanted, key_imitate)
-    rows = jnp.concatenate([rows, wanted[:, None]], axis=1)
-    return state.replace(actor=params, demonstrations=rows)
+    state = state.replace(demonstrations=Demonstrations(rows, size))
+    return state, imitation(recipe, params, key_imitate)
+
+
+@partial(jax.jit, static_argnames=("config", "updates"))
+def imitate_chunk(config: SACConfig, state: SACState, learner: Imitation, updates: int):
+    """``updates`` steps of imitating the demonstrations; returns the learner and its mean loss."""
+    recipe, shown = config.demonstrations, state.demonstrations
+    actor, observe = networks(config)[0], DoublePendulum(config.env).observe
+    rows, wanted = shown.rows[:, :ROW], shown.rows[:, ROW]
+    learner, losses = imitate(recipe, actor, observe, learner, rows, wanted, updates, shown.size)
+    return learner, losses.mean()
+
+
+def structure(config: SACConfig) -> tuple[SACState, Imitation | None]:
+    """What ``begin`` returns, as a structure without numbers, and without the right shapes."""
+
+    def shown(key):
+        state, recipe = _fresh(config, key), config.demonstrations
+        if not recipe.episodes:
+            return state, None
+        return state.replace(
+            demonstrations=Demonstrations(jnp.zeros(()), jnp.zeros(()))
+        ), imitation(recipe, state.actor, key)
+
+    return jax.eval_shape(shown, jax.random.key(0))
 
 
 @partial(jax.jit, static_argnames="config")
@@ -238,13 +282,16 @@ def sample(config: SACConfig, state: SACState, key: jax.Array) -> jax.Array:
     key_own, key_demo = jax.random.split(key)
     half = config.batch_size // 2
     own = draw(state.replay.rows, state.replay.size, key_own, config.batch_size - half)
-    demo = draw(state.demonstrations, state.demonstrations.shape[0], key_demo, half)
+    demo = draw(state.demonstrations.rows, state.demonstrations.size, key_demo, half)
     return jnp.concatenate([demo, jnp.pad(own, ((0, 0), (0, 0), (0, 1)))], axis=1)
 
 
-@partial(jax.jit, static_argnames=("config", "vector_steps"), donate_argnames="state")
+@partial(jax.jit, static_argnames=("config", "vector_steps"))
 def train_chunk(config: SACConfig, state: SACState, vector_steps: int):
-    """``vector_steps`` steps of all environments, with their updates; returns mean metrics."""
+    """``vector_steps`` steps of all environments, with their updates; returns mean metrics.
+
+    ``state`` is not donated: where the new one is not finite, training goes back to the old.
+    """
 
     def learn(state, key):
         key_batch, key_update = jax.random.split(key)
@@ -269,10 +316,38 @@ def train_chunk(config: SACConfig, state: SACState, vector_steps: int):
     return state, metrics | {"temperature": jnp.exp(state.log_temperature)}
 
 
+@partial(jax.jit, static_argnames=("config", "vector_steps"))
+def train_chunks(config: SACConfig, states: list[SACState], vector_steps: int):
+    """``train_chunk`` of several runs at the same step, in one vmap: [(state, metrics), ...].
+
+    What counts steps is the same in all runs and not batched: a batched condition would become a
+    select that copies the replay buffers at every step.
+    """
+    axes = SACState(**{f.name: 0 for f in dataclasses.fields(SACState)}).replace(
+        replay=Replay(0, None, None), env_steps=None, updates=None
+    )
+
+    def per_axis(batched, shared, *trees):
+        def part(axis, *parts):
+            return shared(*parts) if axis is None else jax.tree.map(batched, *parts)
+
+        return jax.tree.map(part, axes, *trees, is_leaf=lambda axis: axis is None)
+
+    stacked = per_axis(lambda *leaves: jnp.stack(leaves), lambda first, *_: first, *states)
+    chunk = jax.vmap(partial(train_chunk, config, vector_steps=vector_steps), (axes,), (axes, 0))
+    after, metrics = chunk(stacked)
+    return [
+        (
+            per_axis(lambda leaf, i=i: leaf[i], lambda shared: shared, after),
+            {name: value[i] for name, value in metrics.items()},
+        )
+        for i in range(len(states))
+    ]
+
+
 def greedy_policy(config: SACConfig, state: SACState) -> Policy:
-    """The deterministic policy as a ``Controller``; its arrays outlive the (donated) state."""
-    actor = jax.tree.map(jnp.copy, state.actor)
-    return to_policy(actor, networks(config)[0], config.env)
+    """The deterministic policy as a ``Controller``."""
+    return to_policy(state.actor, networks(config)[0], config.env)
 
 
 if __name__ == "__main__":

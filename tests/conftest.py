@@ -3,7 +3,9 @@
 Import from here: ``from conftest import assert_close``.
 """
 
+import contextlib
 import os
+import resource
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -56,10 +58,32 @@ def excerpt(name: str) -> dict[str, np.ndarray]:
         return dict(arrays)
 
 
+@contextlib.contextmanager
+def limited_file_size(size: int):
+    """Inside, no file can grow beyond so many bytes, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.fixture(scope="session")
+def whole_run(tmp_path_factory):
+    """The folder of a training run that was never interrupted, and what it said on its errors."""
+    from training_runs import training
+
+    with training(tmp_path_factory.mktemp("training") / "whole") as process:
+        out, err = process.communicate()
+    assert (process.returncode, out) == (0, ""), err
+    return Path(process.args[process.args.index("--runs") + 1]) / "run", err
+
+
 @pytest.fixture(scope="session")
 def imitation():
     """A policy that imitates the pendubot's swing-up, and the imitation that made it."""
-    from jaxpend.demonstrations import DemonstrationConfig, imitate, swingups  # load brax
+    from jaxpend.demonstrations import DemonstrationConfig, imitate, imitation, swingups
     from jaxpend.env import DoublePendulum, EnvConfig
     from jaxpend.networks import Actor, to_policy
 
@@ -68,7 +92,10 @@ def imitation():
     keys = jax.random.split(jax.random.key(0), 3)
     rows, wanted = swingups(config, env, keys[0], reward_scale=0.1)
     untrained = actor.init(keys[1], jax.numpy.zeros(env.observation_size))
-    params, error = imitate(config, actor, env.observe, untrained, rows, wanted, keys[2])
+    state = imitation(config, untrained, keys[2])
+    for _ in range(4):
+        state, loss = imitate(config, actor, env.observe, state, rows, wanted, 2000)
+    params, error = state.params, loss[-100:].mean()
     return SimpleNamespace(
         env=env, actor=actor, rows=rows, wanted=wanted, untrained=untrained, params=params,
         error=error, policy=to_policy(params, actor, env.config),

@@ -1,7 +1,9 @@
 """Signals that ask, and loops that answer."""
 
+import contextlib
 import gc
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -69,3 +71,32 @@ with deferred():
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (-signal.SIGINT, "asked\n")
+
+
+def test_an_interrupted_progress_bar_leaves_the_cursor_on():
+    code = """
+import os, signal, time
+from jaxpend.interrupt import Stopped, deferred, stop_if_asked
+from jaxpend.terminal import LiveProgress
+signal.signal(signal.SIGINT, signal.default_int_handler)
+try:
+    with deferred(), LiveProgress("SAC", 3) as progress:
+        progress.report(1, "note")
+        os.kill(os.getpid(), signal.SIGINT)
+        stop_if_asked()
+except Stopped:
+    os._exit(130)
+"""
+    ours, theirs = pty.openpty()
+    environment = os.environ | {"TERM": "xterm"}
+    line = [sys.executable, "-c", code]
+    with subprocess.Popen(line, stdin=theirs, stdout=theirs, stderr=theirs, env=environment) as p:
+        os.close(theirs)
+        said = b""
+        with contextlib.suppress(OSError):  # the end of a terminal
+            while more := os.read(ours, 4096):
+                said += more
+        os.close(ours)
+    assert p.returncode == 130
+    assert b"once more stops at once" in said
+    assert -1 < said.rindex(b"\x1b[?25l") < said.rindex(b"\x1b[?25h")

@@ -3,12 +3,14 @@
 import dataclasses
 import json
 import math
+import os
 from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
+from conftest import limited_file_size
 
-from jaxpend import JaxpendError, Policy, load_policy
+from jaxpend import JaxpendError, Policy, cli, load_policy
 from jaxpend.config import SNESRun, TrainRun
 from jaxpend.controllers.policy import read_header
 from jaxpend.runs import RunFolder, from_mapping, load_config, to_mapping
@@ -118,12 +120,94 @@ def small_policy():
 
 
 def test_a_run_folder_does_not_take_a_second_run(tmp_path):
-    folder = RunFolder(tmp_path / "deep" / "run", Outer(), "command")
-    folder.log("sac", score=0.5)
-    with pytest.raises(JaxpendError, match="already holds a run") as error:
+    with RunFolder(tmp_path / "deep" / "run", Outer(), "command") as folder:
+        folder.log("sac", score=0.5)
+    with pytest.raises(JaxpendError, match="holds a run with count 3, not 9; choose") as error:
         RunFolder(folder.path, Outer(count=9), "command")
     assert "\n" not in str(error.value)
     assert json.loads((folder.path / "config.json").read_text())["count"] == 3
+
+
+def test_the_same_run_is_taken_up_again_wherever_the_folder_is(tmp_path):
+    config = TrainRun("acrobot", run="a", runs=str(tmp_path))
+    with RunFolder(tmp_path / "a", config, "first") as folder:
+        folder.log("sac", score=0.5)
+    (tmp_path / "a" / ".policy.npz.1234").touch()  # of a process killed while it wrote
+    (tmp_path / "a").rename(tmp_path / "b")
+    config = dataclasses.replace(config, run="b", on_divergence="rollback")
+    with RunFolder(tmp_path / "b", config, "second") as folder:
+        assert len((folder.path / "metrics.jsonl").read_text().splitlines()) == 1
+        assert not list(folder.path.glob("*npz*"))
+        assert json.loads((folder.path / "run.json").read_text())["command"] == "first"
+
+
+def test_only_one_process_works_on_a_run(tmp_path):
+    first = RunFolder(tmp_path, Outer(), "command")
+    with pytest.raises(JaxpendError, match=rf"another process \({os.getpid()}\) is working on"):
+        RunFolder(tmp_path, Outer(), "command")
+    first.close()
+    with RunFolder(tmp_path, Outer(), "command") as again:
+        again.write_json("result.json", {"score": 1.0})
+        # A finished run can be looked at meanwhile.
+        assert RunFolder(tmp_path, Outer(), "command").result == {"score": 1.0}
+
+
+@pytest.mark.parametrize("name", ["config.json", "run.json", "result.json"])
+def test_a_damaged_file_of_a_run_is_one_sentence(tmp_path, name):
+    with RunFolder(tmp_path, Outer(), "command") as folder:
+        folder.write_json("result.json", {"score": 1.0})
+    (tmp_path / name).write_text('{"score"')
+    with pytest.raises(JaxpendError, match=rf"{name} is damaged; choose another name or remove"):
+        RunFolder(tmp_path, Outer(), "command")
+
+
+def test_metrics_go_back_to_a_checkpoint_and_lose_a_row_cut_off(tmp_path):
+    with RunFolder(tmp_path, Outer(), "command") as folder:
+        folder.log("sac", env_steps=1)
+        length = folder.metrics_bytes
+        folder.log("sac", env_steps=2)
+        with (tmp_path / "metrics.jsonl").open("a") as file:
+            file.write('{"stage": "sa')
+        folder.rewind(length, seconds=1000.0)
+        folder.log("sac", env_steps=2)
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["env_steps"] for row in rows] == [1, 2]
+    assert 1000 <= rows[1]["seconds"] < 1060
+
+
+def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path, capsys):
+    with RunFolder(tmp_path / "run", Outer(), "command"):
+        pass
+    before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    (tmp_path / "run" / ".lock").chmod(0o444)
+    for folder in (tmp_path / "run", tmp_path):
+        folder.chmod(0o555)
+    user = os.geteuid()
+    if user == 0:  # may write anywhere
+        tmp_path.parent.chmod(0o755)
+        tmp_path.parents[1].chmod(0o755)
+        os.seteuid(65534)
+    try:
+        for name in ("run", "new"):
+            with pytest.raises(SystemExit) as exit_, cli.guard("prog"):
+                RunFolder(tmp_path / name, Outer(), "command")
+            assert exit_.value.code == 2
+            where = tmp_path / "run" / ".lock" if name == "run" else tmp_path / "new"
+            assert capsys.readouterr().err == f"prog: cannot use {where}: Permission denied\n"
+    finally:
+        os.seteuid(user)
+        for folder in (tmp_path, tmp_path / "run"):
+            folder.chmod(0o755)
+    assert {path: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
+
+
+def test_a_full_disk_takes_no_part_of_a_row(tmp_path):
+    with RunFolder(tmp_path, Outer(), "command") as folder:
+        folder.log("sac", env_steps=1)
+        before = (tmp_path / "metrics.jsonl").read_bytes()
+        with limited_file_size(len(before) + 10), pytest.raises(OSError, match="File too large"):
+            folder.log("sac", env_steps=2)
+    assert (tmp_path / "metrics.jsonl").read_bytes() == before
 
 
 def test_metrics_are_one_strict_json_row_an_evaluation(tmp_path):
@@ -155,5 +239,10 @@ def test_policies_say_what_made_them_and_replace_the_old_file_whole(tmp_path, mo
     with pytest.raises(OSError, match="No space left"):
         folder.save("policy.npz", small_policy().replace(robot="acrobot"))
     assert path.read_bytes() == before
-    assert {p.name for p in tmp_path.iterdir()} == {"config.json", "policy.npz"}
+    assert {p.name for p in tmp_path.iterdir()} == {
+        ".lock",
+        "config.json",
+        "policy.npz",
+        "run.json",
+    }
     assert load_policy(path).robot == "pendubot"

@@ -70,6 +70,18 @@ small = partial(
     SACConfig, num_envs=16, batch_size=64, warmup_steps=0, replay_capacity=4096, reward_scale=1.0,
     actor_hidden=(16,), critic_hidden=(32,), learning_rate=3e-3, target_rate=0.05,
 )  # fmt: skip
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _probes_are_environments():
+    """SAC makes its environments of these configurations too."""
+    real, patch = sac.DoublePendulum, pytest.MonkeyPatch()
+    make = lambda config: config.make() if isinstance(config, Probe) else real(config)  # noqa: E731
+    patch.setattr(sac, "DoublePendulum", make)
+    yield
+    patch.undo()
+
+
 VALUE = small(env=Probe(stay), discount=0.8, init_temperature=0.5, actor_delay=10**9)
 CREDIT = small(env=Probe(credit), discount=0.9, init_temperature=0.02, target_entropy=-2.0)
 REPLAY = small(
@@ -279,7 +291,8 @@ def test_batches_come_from_filled_rows_and_half_of_them_from_demonstrations():
     own = np.asarray(sac.sample(config, state.replace(replay=replay), KEY))
     assert own.shape == (config.updates_per_step, 64, ROW)
     assert set(own[..., 0].ravel()) == set(range(20))
-    demonstrations = -1 - jnp.arange(7.0)[:, None] * jnp.ones(ROW + 1)
+    rows = -1 - jnp.arange(9.0)[:, None] * jnp.ones(ROW + 1)
+    demonstrations = sac.Demonstrations(rows, jnp.asarray(7))
     state = state.replace(replay=replay, demonstrations=demonstrations)
     both = np.asarray(sac.sample(config, state, KEY))
     assert both.shape == (config.updates_per_step, 64, ROW + 1)

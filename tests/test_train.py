@@ -1,33 +1,24 @@
 """The whole job and its commands: what is left on disk, and how each kind of bad input ends."""
 
-import contextlib
 import json
-import signal
+import shutil
 import subprocess
 import sys
-import time
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from training_runs import OPTIONS, rows_of
 
 from jaxpend import Policy, cli, load_policy, save_policy
 from jaxpend.config import SACRun, SNESRun, TrainRun
 from jaxpend.controllers.policy import read_header
 from jaxpend.score import official
 
-RECIPE = Path(__file__).parents[1] / "experiments" / "pendubot.yaml"
 CRITERIA = {
     "swingup_time", "energy", "tau_cost", "tau_smoothness", "velocity_cost", "max_tau",
     "integ_tau",
 }  # fmt: skip
-TINY = """
-    --seed 3 --sac.steps 128 --sac.eval-every 64 --sac.num-envs 8 --sac.batch-size 32
-    --sac.replay-capacity 64 --sac.critic-hidden 8 --sac.actor-hidden 8
-    --sac.demonstrations.episodes 2 --sac.demonstrations.duration 1
-    --sac.demonstrations.updates 20 --sac.demonstrations.batch-size 32
-"""
 FINE = "--snes.generations 3 --snes.population 4 --snes.chunk 2"
 
 
@@ -37,13 +28,6 @@ def policy_file(folder, robot="pendubot"):
     layers = ((jnp.full((6, 4), 0.3), jnp.zeros(4)), (jnp.ones((4, 1)), jnp.zeros(1)))
     save_policy(path, Policy(layers, torque_limit=jnp.asarray(3.0), robot=robot))
     return path
-
-
-def rows_of(folder, stage):
-    """Rows of ``metrics.jsonl`` of one stage."""
-    lines = (folder / "metrics.jsonl").read_text().splitlines()
-    rows = [json.loads(line, parse_constant=pytest.fail) for line in lines]
-    return [row for row in rows if row["stage"] == stage]
 
 
 def run_command(monkeypatch, kind, *arguments):
@@ -57,37 +41,26 @@ def run_command(monkeypatch, kind, *arguments):
             raise
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A run folder that ``python -m jaxpend.train`` has left, and what it printed."""
-    runs = tmp_path_factory.mktemp("runs")
-    line = [sys.executable, "-m", "jaxpend.train", "--config", RECIPE, "--runs", runs]
-    line += [*TINY.split(), *FINE.split()]
-    done = subprocess.run(line, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return runs / "pendubot-seed3", done
-
-
-def test_a_run_leaves_its_configuration_metrics_policies_and_result(run):
-    folder, done = run
-    names = {"config.json", "metrics.jsonl", "result.json", "policy.npz"}
+def test_a_run_leaves_its_configuration_metrics_policies_and_result(whole_run):
+    folder, said = whole_run
+    names = {".lock", "config.json", "run.json", "metrics.jsonl", "result.json", "policy.npz"}
     names |= {f"{stage}_{kept}.npz" for stage in ("sac", "snes") for kept in ("best", "last")}
     assert {path.name for path in folder.iterdir()} == names
     config = json.loads((folder / "config.json").read_text(), parse_constant=pytest.fail)
-    assert (config["seed"], config["robot"], config["sac"]["steps"]) == (3, "pendubot", 128)
-    assert [row["env_steps"] for row in rows_of(folder, "sac")] == [0, 64, 128]
-    assert [row["generation"] for row in rows_of(folder, "snes")] == [2, 3]
+    assert (config["seed"], config["robot"], config["sac"]["steps"]) == (3, "pendubot", 1024)
+    assert [row["updates"] for row in rows_of(folder, "imitation")] == [*range(2000, 20001, 2000)]
+    assert [row["env_steps"] for row in rows_of(folder, "sac")] == [*range(0, 1025, 32)]
+    assert [row["generation"] for row in rows_of(folder, "snes")] == [*range(1, 13)]
     for stage in ("sac", "snes"):
         assert all(0 <= row.get("score", 0) < 1 for row in rows_of(folder, stage))
-    # Progress from the first moment on, the results last; nothing on standard output.
-    assert done.stdout == ""
-    words = ["imitating demonstrations", "SAC 64/128", "SNES 2/3", "after SNES", str(folder.name)]
-    places = [done.stderr.replace("\n", "").index(word) for word in words]
-    assert places == sorted(places)
+    # Progress from the first moment on, the results last.
+    words = ["imitating demonstrations: compiling", "SAC 64/1,024", "SNES 2/12", "after SNES"]
+    places = [said.replace("\n", "").index(word) for word in [*words, str(folder.name)]]
+    assert places[:-1] == sorted(places[:-1])
 
 
-def test_the_result_is_the_official_score_of_the_policy(run):
-    folder, _ = run
+def test_the_result_is_the_official_score_of_the_policy(whole_run):
+    folder, _ = whole_run
     result = json.loads((folder / "result.json").read_text(), parse_constant=pytest.fail)
     policy = load_policy(folder / "policy.npz", robot="pendubot")
     again = official(policy, "pendubot")
@@ -104,18 +77,44 @@ def test_the_result_is_the_official_score_of_the_policy(run):
     np.testing.assert_array_equal(kept.layers[0][0], policy.layers[0][0])
 
 
-def test_a_run_folder_is_not_overwritten(run, monkeypatch, capsys):
-    folder, _ = run
-    before = (folder / "result.json").read_bytes()
+def test_a_finished_run_is_not_trained_again(whole_run, monkeypatch, capsys):
+    folder, _ = whole_run
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    run_command(monkeypatch, TrainRun, *OPTIONS, "--runs", folder.parent)
+    score = json.loads((folder / "result.json").read_text())["score"]
+    assert f"is finished: score {score:.4f}" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--sac.discount 0.9", "holds a run with sac.discount 0.99, not 0.9; choose another name"),
+        ("--sac.env.reward.floor -2", "holds a run with sac.env.reward.floor -10.0, not -2.0;"),
+        ("--seed 4", "holds a run with seed 3, not 4;"),
+        ("--sac.actor-hidden 8 8", "holds a run with sac.actor_hidden [8], not [8, 8];"),
+        ("version", "holds a run of jaxpend 0.0.9, this is"),
+    ],
+)
+def test_a_run_of_another_kind_is_left_alone(
+    whole_run, monkeypatch, capsys, tmp_path, options, words
+):
+    folder = tmp_path / "run"
+    shutil.copytree(whole_run[0], folder)
+    (folder / "result.json").unlink()
+    if options == "version":
+        (folder / "run.json").write_text('{"version": "0.0.9"}')
+        options = ""
+    before = {path: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(SystemExit) as exit_:
-        run_command(monkeypatch, TrainRun, "--seed", 3, "--runs", folder.parent)
+        run_command(monkeypatch, TrainRun, *OPTIONS, "--runs", tmp_path, *options.split())
     assert exit_.value.code == 2
-    assert "already holds a run" in capsys.readouterr().err
-    assert (folder / "result.json").read_bytes() == before
+    assert words in one_sentence(capsys.readouterr().err)
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_snes_starts_from_a_policy_file(run, monkeypatch, tmp_path):
-    start = run[0] / "sac_best.npz"
+def test_snes_starts_from_a_policy_file(whole_run, monkeypatch, tmp_path):
+    start = whole_run[0] / "sac_best.npz"
     options = ["--policy", start, "--runs", tmp_path, "--run", "fine", *FINE.split()]
     run_command(monkeypatch, SNESRun, *options)
     result = json.loads((tmp_path / "fine" / "result.json").read_text())
@@ -123,47 +122,6 @@ def test_snes_starts_from_a_policy_file(run, monkeypatch, tmp_path):
     assert result["score"] >= result["start"]["score"]
     names = {path.name for path in (tmp_path / "fine").iterdir()}
     assert {"policy.npz", "snes_best.npz", "snes_last.npz"} <= names
-
-
-@pytest.fixture
-def _interruptible():
-    """Children can be interrupted, even if these tests run in the background of a shell."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@contextlib.contextmanager
-def started(*line):
-    """A process that is killed, and whose pipes are closed, whatever happens to the test."""
-    pipe = subprocess.PIPE
-    with subprocess.Popen([*map(str, line)], stdout=pipe, stderr=pipe, text=True) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
-@pytest.mark.usefixtures("_interruptible")
-@pytest.mark.parametrize(
-    ("stage", "signum"), [("imitation", signal.SIGTERM), ("sac", signal.SIGINT)]
-)
-def test_a_signal_stops_a_run_and_leaves_the_best_policy_so_far(tmp_path, stage, signum):
-    long = {"imitation": "--sac.demonstrations.updates", "sac": "--sac.steps"}[stage]
-    line = [sys.executable, "-m", "jaxpend.train", *TINY.split(), "--runs", tmp_path]
-    with started(*line, "--run", "stopped", long, "1_000_000") as process:
-        best = tmp_path / "stopped" / "sac_best.npz"
-        waits_for = {"imitation": tmp_path / "stopped" / "config.json", "sac": best}[stage]
-        while not waits_for.exists() and process.poll() is None:
-            time.sleep(0.05)
-        process.send_signal(signum)
-        out, err = process.communicate(timeout=300)
-    assert process.returncode == 128 + signum, err
-    assert out == ""
-    assert "stopped; the best policies so far are in" in one_sentence(err)
-    assert not (tmp_path / "stopped" / "result.json").exists()
-    if stage == "sac":
-        load_policy(best, robot="pendubot")
 
 
 def one_sentence(err):

@@ -1,0 +1,200 @@
+"""Runs that are killed, interrupted or diverge, and go on."""
+
+import dataclasses
+import json
+import shlex
+import signal
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from training_runs import OPTIONS, arrays_of, result_of, rows_of, training
+
+from jaxpend import JaxpendError, Policy, load_policy, sac, snes
+from jaxpend.checkpoint import Checkpoints
+from jaxpend.config import DemonstrationConfig, SACConfig, SACRun, SNESConfig
+from jaxpend.interrupt import Stopped
+from jaxpend.stages import SAC, SNES
+from jaxpend.train import all_finite, train
+
+
+def wait(process, until):
+    """Wait for something that a process does before it ends."""
+    while not until():
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.002)
+
+
+def test_a_run_killed_again_and_again_ends_as_one_that_never_was(whole_run):
+    whole, _ = whole_run
+    runs = whole.parents[1] / "killed"
+    folder, often = runs / "run", ("--checkpoint.every", "0")
+
+    def reached(stage, count, writing=False):
+        def now():
+            tmp = not writing or any((folder / "checkpoints").glob("*tmp*"))
+            return tmp and len(rows_of(folder, stage)) >= count
+
+        return now
+
+    moments = [
+        (reached("imitation", 1, writing=True), signal.SIGKILL),
+        (reached("sac", 4), signal.SIGINT),
+        (reached("sac", 9, writing=True), signal.SIGKILL),
+        (reached("snes", 2), signal.SIGTERM),
+        (reached("snes", 4), signal.SIGKILL),
+    ]
+    said = []
+    for until, signum in moments:
+        with training(runs, *often) as process:
+            wait(process, until)
+            before = rows_of(folder)
+            process.send_signal(signum)
+            out, err = process.communicate()
+        said.append(err)
+        assert (out, "Traceback" in err) == ("", False)
+        assert not (folder / "result.json").exists()
+        assert rows_of(folder)[: len(before)] == before
+        if signum == signal.SIGKILL:
+            assert process.returncode == -signum
+            continue
+        assert process.returncode == 128 + signum
+        last = err.splitlines()[-1]
+        assert last.startswith("jaxpend train: stopped in S")
+        command = ["jaxpend", "train", *OPTIONS, "--runs", str(runs), *often]
+        assert last.endswith(f"is in {folder}; to go on: {shlex.join(command)}")
+    with training(runs, *often) as process:
+        _, err = process.communicate()
+    said.append(err)
+    assert process.returncode == 0, err
+    for text, stage in zip(said[2:], ["SAC", "SAC", "SNES", "SNES"], strict=True):
+        assert f"resuming {folder} in {stage} at " in text
+    assert rows_of(folder) == rows_of(whole)
+    assert result_of(folder) == result_of(whole)
+    for name in ("sac_best.npz", "sac_last.npz", "snes_best.npz", "snes_last.npz", "policy.npz"):
+        killed, never = arrays_of(folder / name), arrays_of(whole / name)
+        assert killed.keys() == never.keys()
+        for key in killed:
+            np.testing.assert_array_equal(killed[key], never[key])
+    assert {p.name for p in folder.iterdir()} == {p.name for p in whole.iterdir()}
+
+
+SMALL = SACConfig(
+    steps=96, eval_every=32, num_envs=8, batch_size=32, replay_capacity=128, warmup_steps=32,
+    critic_hidden=(8,), actor_hidden=(8,),
+)  # fmt: skip
+
+
+def poison(monkeypatch, *poisoned):
+    """Let the calls of these numbers of a chunk return a temperature that is not a number."""
+    chunk, calls = sac.train_chunk, []
+
+    def train_chunk(config, state, steps):
+        calls.append(state)
+        state, metrics = chunk(config, state, steps)
+        if len(calls) in poisoned:
+            state = state.replace(log_temperature=state.log_temperature * jnp.nan)
+        return state, metrics
+
+    monkeypatch.setattr(sac, "train_chunk", train_chunk)
+    return calls
+
+
+def diverging(tmp_path, **options):
+    """A run that diverges in its second chunk: why it stopped, and its rows."""
+    with pytest.raises(JaxpendError) as error:
+        train(SACRun(run="run", runs=str(tmp_path), sac=SMALL, **options))
+    return str(error.value), rows_of(tmp_path / "run", "sac")
+
+
+def test_divergence_stops_with_the_last_good_state_on_disk(tmp_path, capfd, monkeypatch):
+    poison(monkeypatch, *range(2, 9))
+    text, rows = diverging(tmp_path)
+    start = "SAC diverged at 64 steps; the last good state, in SAC at 32 of 96 steps, is in"
+    assert text.startswith(f"{start} {tmp_path / 'run' / 'checkpoints'}, the best policy beside")
+    assert "--on-divergence rollback" in text
+    assert [(row["env_steps"], row.get("finite", 1)) for row in rows] == [(0, 1), (32, 1), (64, 0)]
+    found, about = Checkpoints(tmp_path / "run" / "checkpoints").newest(
+        lambda about: {"state": sac.structure(SMALL)[0], "best": SAC(SMALL).policy_like()}
+    )
+    assert (int(found["state"].env_steps), about["stage"]) == (32, "sac")
+    assert all_finite(found["state"])
+    load_policy(tmp_path / "run" / "sac_best.npz")
+    assert not (tmp_path / "run" / "result.json").exists()
+    assert diverging(tmp_path) == (text, rows)  # the same again, and no row twice
+    # Resumed with another answer to it: as often as it may, each time with another key.
+    text, rows = diverging(tmp_path, on_divergence="rollback", max_rollbacks=2)
+    assert text.startswith(start)
+    assert "--on-divergence" not in text
+    assert [row["rollbacks"] for row in rows if row.get("finite") == 0] == [0, 1, 2]
+    assert capfd.readouterr().err.count("going on in SAC at 32 of 96 steps with another key") == 2
+
+
+def test_a_rollback_goes_on_from_the_last_chunk_with_another_key(tmp_path, monkeypatch):
+    calls = poison(monkeypatch, 2)
+    options = {"run": "run", "runs": str(tmp_path), "sac": SMALL, "on_divergence": "rollback"}
+    assert train(SACRun(**options))["score"] >= 0
+    rows = rows_of(tmp_path / "run", "sac")
+    assert [(row["env_steps"], row.get("finite", 1), row["rollbacks"]) for row in rows[1:]] == [
+        (32, 1, 0), (64, 0, 0), (64, 1, 1), (96, 1, 1),
+    ]  # fmt: skip
+    before, after = calls[1:3]
+    np.testing.assert_array_equal(before.replay.rows, after.replay.rows)
+    assert not np.array_equal(*(jax.random.key_data(s.key) for s in (before, after)))
+    assert rows[2]["reward"] != rows[3]["reward"]
+
+
+def test_seeds_in_one_vmap_stop_resume_and_come_to_what_they_come_to_alone(tmp_path, monkeypatch):
+    recipe = DemonstrationConfig(episodes=2, duration=1.0, updates=20, batch_size=32)
+    taught = dataclasses.replace(SMALL, demonstrations=recipe, imitation=1.0)
+    config = SACRun(seeds=2, seed=4, run="alone", runs=str(tmp_path), sac=taught)
+    train(config)
+    together = dataclasses.replace(config, run="together", vmap="yes")
+    looks = []
+
+    def look():
+        looks.append(None)
+        if len(looks) == 3:
+            raise Stopped(signal.SIGINT)
+
+    monkeypatch.setattr("jaxpend.train.stop_if_asked", look)
+    with pytest.raises(Stopped, match="stopped in SAC at 32 of 96 steps; everything is in "):
+        train(together)
+    assert not (tmp_path / "together" / "seeds.json").exists()
+    group = train(together)
+    for seed in (4, 5):
+        loop, vmap = (tmp_path / run / f"seed{seed}" for run in ("alone", "together"))
+        assert [row["env_steps"] for row in rows_of(loop, "sac")] == [0, 32, 64, 96]
+        for a, b in zip(rows_of(loop), rows_of(vmap), strict=True):
+            assert (a.keys(), a.pop("stage")) == (b.keys(), b.pop("stage"))
+            np.testing.assert_allclose(list(a.values()), list(b.values()), rtol=1e-3, atol=1e-4)
+        a, b = arrays_of(loop / "sac_last.npz"), arrays_of(vmap / "sac_last.npz")
+        for key in a:
+            np.testing.assert_allclose(a[key], b[key], rtol=1e-3, atol=1e-4)
+    assert json.loads((tmp_path / "together" / "seeds.json").read_text()) == group
+    assert group["seeds"] == [4, 5]
+    scores = [result_of(tmp_path / "together" / f"seed{s}")["score"] for s in (4, 5)]
+    assert group["stages"]["sac"]["scores"] == scores
+
+
+def test_searches_in_one_vmap_come_to_what_they_come_to_alone(monkeypatch):
+    def fitness(config, policy, key, robot):
+        distance = sum(jnp.sum((leaf - 0.1) ** 2) for leaf in jax.tree.leaves(policy.layers))
+        return -distance, jnp.zeros((), jnp.int32)
+
+    monkeypatch.setattr(snes, "fitness", fitness)
+    snes.evolve.clear_cache()
+    policy = Policy(((jnp.zeros((6, 1)), jnp.zeros(1)),), torque_limit=jnp.asarray(3.0))
+    stage = SNES(SNESConfig(generations=6, population=4, chunk=4), policy)
+    states = [stage.start(seed, policy) for seed in (1, 2)]
+    loop = [stage.advance([state])[0] for state in states]
+    for alone, together in zip(loop, stage.advance(states), strict=True):
+        assert jax.tree.structure(alone) == jax.tree.structure(together)
+        assert stage.done(alone[0]) == stage.done(together[0]) == 4
+        for a, b in zip(*map(stage.watched, (alone[0], together[0])), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+    assert not np.array_equal(*(state["search"].strategy.mean for state, _ in loop))
+    assert stage.done(stage.advance([loop[0][0]])[0][0]) == 6  # and not beyond the last
+    snes.evolve.clear_cache()
