@@ -33,7 +33,7 @@ install: $(STAMP)  ## make .venv with pinned versions
 train: $(STAMP)  ## SAC, then SNES, for ROBOT; ends with the official score
 	$(BIN)/jaxpend train --config experiments/$(ROBOT).yaml --seed $(SEED) --run $(RUN) $(ARGS)
 
-snes: $(STAMP)  ## fine-tune a policy by SNES: ARGS='--policy FILE'
+snes: $(STAMP)  ## fine-tune by SNES: ARGS='--policy FILE' or '--controller NAME'
 	$(BIN)/jaxpend snes --robot $(ROBOT) --seed $(SEED) $(ARGS)
 
 score: $(STAMP)  ## official score of the shipped policy, or ARGS='--policy FILE'

@@ -5,6 +5,7 @@
     python experiments/bench.py --parts seeds
 
 Compile and run times are given apart; every figure is the median of five runs, of MPC one run.
+The processor's seconds, of all cores together, are what a busy machine does not change.
 """
 
 import argparse
@@ -38,20 +39,21 @@ def random_policy(width: int) -> Policy:
     return Policy(layers, jnp.asarray(3.0), observation=observation, activation="tanh")
 
 
-def timed(f, *args, runs: int = 5) -> tuple[float, float]:
-    """Seconds of the first call beyond a run (compilation), and the median of some runs."""
+def timed(f, *args, runs: int = 5) -> tuple[float, float, float]:
+    """Seconds of the first call beyond a run (compilation); medians of a run and its processor."""
     seconds = []
     for _ in range(1 + runs):
-        start = time.perf_counter()
+        start = time.perf_counter(), time.process_time()
         jax.block_until_ready(f(*args))
-        seconds.append(time.perf_counter() - start)
-    run = float(np.median(seconds[1:]))
-    return seconds[0] - run, run
+        seconds.append((time.perf_counter() - start[0], time.process_time() - start[1]))
+    run, processor = np.median(seconds[1:], axis=0)
+    return seconds[0][0] - run, run, processor
 
 
-def show(name: str, compile_time: float, seconds: float, speed: str = "") -> None:
+def show(name: str, times: tuple[float, float, float], speed: str = "") -> None:
     """A line of the table."""
-    print(f"{name:44s}{compile_time:12.2f}{seconds:10.3f}  {speed}".rstrip(), flush=True)
+    numbers = "{:12.2f}{:10.3f}{:15.3f}".format(*times)
+    print(f"{name:44s}{numbers}  {speed}".rstrip(), flush=True)
 
 
 def bench_seeds(count: int = 4) -> None:
@@ -60,7 +62,7 @@ def bench_seeds(count: int = 4) -> None:
     # Imitation is not timed, and what is learned does not matter: few demonstrations will do.
     shown = dataclasses.replace(recipe.sac.demonstrations, episodes=20, updates=1)
     config = dataclasses.replace(recipe.sac, demonstrations=shown, actor_delay=0)
-    search = SNES(recipe.snes, random_policy(64))
+    search = SNES(recipe.snes, random_policy(64), recipe.robot)
     training = SAC(config)
     keys = [jax.random.key(seed) for seed in range(count)]
     parts = {
@@ -72,10 +74,9 @@ def bench_seeds(count: int = 4) -> None:
         vmap = lambda stage=stage, states=states: stage.advance(states)  # noqa: E731
         times = []
         for how, f in (("one after another", loop), ("vmap", vmap)):
-            compile_time, run = timed(f)
-            times.append(run)
-            speed = f"({times[0] / run:.2f} x as fast)"
-            show(f"{name}: a chunk of {count} seeds, {how}", compile_time, run, speed)
+            times.append(timed(f))
+            speed = f"({times[0][1] / times[-1][1]:.2f} x as fast)"
+            show(f"{name}: a chunk of {count} seeds, {how}", times[-1], speed)
 
 
 def rollouts(controller, robot: str, name: str, batches, runs: int = 5) -> None:
@@ -88,9 +89,9 @@ def rollouts(controller, robot: str, name: str, batches, runs: int = 5) -> None:
         def scored(x0):
             return score_v2(performance(controller, Scenario(plant, x0=x0), jax.random.key(0)))
 
-        compile_time, seconds = timed(jax.jit(jax.vmap(scored)), starts, runs=runs)
-        speed = f"({batch * 10 / seconds:,.1f} x real time)"
-        show(f"{batch} scored rollouts of 10 s, {name}", compile_time, seconds, speed)
+        times = timed(jax.jit(jax.vmap(scored)), starts, runs=runs)
+        speed = f"({batch * 10 / times[1]:,.1f} x real time)"
+        show(f"{batch} scored rollouts of 10 s, {name}", times, speed)
 
 
 def bench_rollouts() -> None:
@@ -118,11 +119,11 @@ def bench_sac() -> None:
         state, metrics = sac.train_chunk(config, state, vector_steps)
         return metrics
 
-    compile_time, seconds = timed(chunk)
-    updates = vector_steps * config.updates_per_step / seconds
-    steps = vector_steps * config.num_envs / seconds
+    times = timed(chunk)
+    updates = vector_steps * config.updates_per_step / times[1]
+    steps = vector_steps * config.num_envs / times[1]
     speed = f"({updates:,.0f} updates/s, {steps:,.0f} steps/s)"
-    show(f"SAC: {vector_steps} vector steps, 2x128", compile_time, seconds, speed)
+    show(f"SAC: {vector_steps} vector steps, 2x128", times, speed)
 
 
 def bench_snes() -> None:
@@ -132,8 +133,9 @@ def bench_snes() -> None:
         policy = random_policy(64)
         start = snes.init(config, policy, jax.random.key(0))
         evolve = lambda s, c=config, p=policy: snes.evolve(c, p, s, 2)[1]  # noqa: E731
-        compile_time, seconds = timed(evolve, start)
-        show(f"SNES: a generation of 40, {scenarios} scenarios, 2x64", compile_time, seconds / 2)
+        compile_time, *rest = timed(evolve, start)
+        times = (compile_time, *(seconds / 2 for seconds in rest))
+        show(f"SNES: a generation of 40, {scenarios} scenarios, 2x64", times)
 
 
 PARTS = {
@@ -149,7 +151,7 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", default=quick, choices=PARTS)
     parts = parser.parse_args().parts
     print(f"jax {jax.__version__}, {jax.devices()[0].device_kind}, {jax.device_count()} device(s)")
-    print(f"{'':44s}{'compile [s]':>12s}{'run [s]':>10s}")
+    print(f"{'':44s}{'compile [s]':>12s}{'run [s]':>10s}{'processor [s]':>15s}")
     for name in parts:
         PARTS[name]()
 

@@ -48,7 +48,7 @@ COMMANDS = {
     ),
     "snes": Command(
         "train a policy",
-        "SNES on the official score, from a policy file",
+        "SNES on the official score, from a policy or any other controller",
         "--robot acrobot --policy runs/mine/sac_best.npz --snes.generations 400",
     ),
     "score": Command(

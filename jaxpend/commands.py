@@ -42,7 +42,7 @@ def sac(config: SACRun, command: str) -> None:
 
 
 def snes(config: SNESRun, command: str) -> None:
-    """SNES on the official score, from a policy file, in a run folder."""
+    """SNES on the official score, from a policy or any other controller, in a run folder."""
     from .train import execute
 
     execute(config, command)

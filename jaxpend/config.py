@@ -244,9 +244,10 @@ class SACRun(Run):
 
 @dataclasses.dataclass(frozen=True)
 class SNESRun(Run):
-    """SNES alone, from a policy file."""
+    """SNES alone, from a policy or any other controller."""
 
-    policy: str = ""  # where to start; empty: the policy that ships with the package
+    policy: str = ""  # file to start from; empty: the policy that ships with the package
+    controller: str = ""  # start instead from a known one, around that policy, or module:name
     snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
 
 

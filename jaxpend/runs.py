@@ -19,7 +19,7 @@ from .errors import JaxpendError
 from .files import to_json, write_atomically
 
 if TYPE_CHECKING:
-    from .controllers.policy import Policy
+    from .controllers.base import Controller
 
 __all__ = ["RunFolder", "from_mapping", "load_config", "to_mapping"]
 
@@ -237,10 +237,10 @@ class RunFolder:
         elif self._tensorboard:
             self._events = tensorboard.Events(self.path)  # of all rows, this one too
 
-    def save(self, name: str, policy: "Policy", **provenance: Any) -> Path:
-        """Write a policy file with the command and configuration that made it."""
-        from .controllers.policy import save_policy  # loads jax; configurations do without
+    def save(self, name: str, policy: "Controller", **provenance: Any) -> Path:
+        """Write a policy or controller file with the command and configuration that made it."""
+        from .controllers.saved import save_controller  # loads jax; configurations do without
 
         made_by = {"command": self.command, "version": __version__, "config": self.config}
-        save_policy(self.path / name, policy, provenance | made_by)
+        save_controller(self.path / name, policy, self.config["robot"], provenance | made_by)
         return self.path / name

@@ -189,9 +189,14 @@ def nominal_run(controller: Controller, robot: str) -> tuple[Trajectory, Criteri
     return run, criteria(run.t, run.x, run.u, plant)
 
 
+def _in_float64(leaf):
+    return jnp.asarray(leaf, "f8") if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) else leaf
+
+
 def official(controller: Controller, robot: str) -> dict:
     """Score, success and criteria of a controller as plain numbers, computed in float64."""
     with jax.enable_x64(True):
+        controller = jax.tree.map(_in_float64, controller)
         c = nominal(controller, robot)
         names = [name for name in vars(c) if name != "success"]
         return {

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from . import sac, snes
 from .config import SACConfig, SNESConfig
+from .controllers.parameters import kinds
 from .controllers.policy import Policy
 from .score import nominal, score_v2
 
@@ -157,21 +158,27 @@ class SAC(Stage):
 
 
 class SNES(Stage):
-    """SNES on the official score from a policy; its state is that policy and the search's.
+    """SNES on the official score from any controller; its state is that and the search's.
 
-    Judged are the mean policy and the best individual so far, both without noise and, for the
+    Judged are the mean controller and the best individual so far, both without noise and, for the
     metrics, on fresh noise.
     """
 
     name, title, unit, column = "snes", "SNES", "generations", "generation"
 
-    def __init__(self, config: SNESConfig, policy: Any):
-        """``policy`` is one of the structure that the search starts from."""
+    def __init__(self, config: SNESConfig, policy: Any, robot: str):
+        """``policy`` is a controller of the structure that the search starts from.
+
+        Raises ``JaxpendError`` if it has nothing to search.
+        """
+        kinds(policy, config.searched)
         self.config, self.total, self.policy = config, config.generations, policy
-        self.fresh_fitness = jax.jit(lambda policy, key: snes.fitness(config, policy, key)[0])
+        self.robot = robot
+        self.fresh_fitness = jax.jit(lambda p, key: snes.fitness(config, p, key, robot)[0])
 
         def evolve_all(policies, searches, count):
-            return jax.vmap(lambda p, s: snes.evolve(config, p, s, count))(policies, searches)
+            one = lambda p, s: snes.evolve(config, p, s, count, robot)  # noqa: E731
+            return jax.vmap(one)(policies, searches)
 
         self.evolve_all = jax.jit(evolve_all, static_argnames="count")
 
@@ -197,7 +204,7 @@ class SNES(Stage):
 
         both = [(state["start"], state["search"]) for state in states]
         if len(states) == 1:
-            after = [snes.evolve(self.config, *both[0], count)]
+            after = [snes.evolve(self.config, *both[0], count, self.robot)]
         else:
             stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *both)
             found = self.evolve_all(*stacked, count)
@@ -215,7 +222,7 @@ class SNES(Stage):
         found = {"mean": snes.mean_controller, "individual": snes.best_controller}
         for name, policy_of in found.items():
             policy = policy_of(self.config, start, search)
-            score = float(score_v2(nominal(policy, policy.robot)))
+            score = float(score_v2(nominal(policy, self.robot)))
             row[f"{name}_score"] = score
             row[f"{name}_fresh_fitness"] = self.fresh_fitness(policy, key)
             candidates.append((policy, score))

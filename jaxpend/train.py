@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from . import designs
 from .checkpoint import Checkpoints
 from .config import Run, SACRun, SNESRun, TrainRun
-from .controllers.policy import Policy, load_policy
+from .controllers.known import find_controller
+from .controllers.policy import Policy
 from .errors import JaxpendError
 from .files import to_json, write_atomically
 from .interrupt import Stopped, deferred, stop_if_asked
@@ -210,7 +212,7 @@ def stages_of(config: Run, start: Policy | None) -> dict[str, Stage]:
         stages.append(SAC(config.sac))
         start = stages[-1].policy_like()
     if isinstance(config, SNESRun | TrainRun):
-        stages.append(SNES(config.snes, start))
+        stages.append(SNES(config.snes, start, config.robot))
     return {stage.name: stage for stage in stages}
 
 
@@ -229,7 +231,8 @@ def train(config: Run, command: str = "jaxpend.train.train") -> dict:
     """
     start = None
     if isinstance(config, SNESRun):  # before the folder is made: a wrong file leaves nothing behind
-        start = load_policy(config.policy or config.robot, robot=config.robot)
+        plant = designs.competition(config.robot)
+        start = find_controller(config.policy, config.controller, plant, config.robot)
     stages = stages_of(config, start)
     vmap = config.vmap == "yes" or (config.vmap == "auto" and jax.default_backend() != "cpu")
     with contextlib.ExitStack() as opened:

@@ -187,7 +187,7 @@ def test_searches_in_one_vmap_come_to_what_they_come_to_alone(monkeypatch):
     monkeypatch.setattr(snes, "fitness", fitness)
     snes.evolve.clear_cache()
     policy = Policy(((jnp.zeros((6, 1)), jnp.zeros(1)),), torque_limit=jnp.asarray(3.0))
-    stage = SNES(SNESConfig(generations=6, population=4, chunk=4), policy)
+    stage = SNES(SNESConfig(generations=6, population=4, chunk=4), policy, "pendubot")
     states = [stage.start(seed, policy) for seed in (1, 2)]
     loop = [stage.advance([state])[0] for state in states]
     for alone, together in zip(loop, stage.advance(states), strict=True):

@@ -1,19 +1,25 @@
 """The whole job and its commands: what is left on disk, and how each kind of bad input ends."""
 
+import dataclasses
 import json
 import shutil
+import signal
 import subprocess
 import sys
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from training_runs import OPTIONS, rows_of
+from training_runs import OPTIONS, arrays_of, rows_of
 
-from jaxpend import Policy, cli, load_policy, save_policy
-from jaxpend.config import SACRun, SNESRun, TrainRun
+from jaxpend import Policy, cli, designs, load_policy, save_policy
+from jaxpend.config import SACRun, SNESConfig, SNESRun, TrainRun
+from jaxpend.controllers import load_controller
+from jaxpend.controllers.known import build
 from jaxpend.controllers.policy import read_header
+from jaxpend.interrupt import Stopped
 from jaxpend.score import official
+from jaxpend.train import train
 
 CRITERIA = {
     "swingup_time", "energy", "tau_cost", "tau_smoothness", "velocity_cost", "max_tau",
@@ -124,6 +130,38 @@ def test_snes_starts_from_a_policy_file(whole_run, monkeypatch, tmp_path):
     assert {"policy.npz", "snes_best.npz", "snes_last.npz"} <= names
 
 
+def test_snes_fine_tunes_any_controller_and_goes_on_where_it_was(monkeypatch, tmp_path):
+    snes = SNESConfig(generations=4, population=4, chunk=2, searched="gain", gain_sigma=0.3)
+    run = SNESRun(controller="tvlqr", runs=str(tmp_path), run="whole", snes=snes)
+    result = train(run)
+    assert result["score"] >= result["start"]["score"] > 0.7
+    last = load_controller(tmp_path / "whole" / "snes_last.npz", robot="pendubot")
+    start = build("tvlqr", designs.competition("pendubot"), "pendubot")
+    assert np.abs(last.gain / start.gain - 1).max() > 0.01
+    np.testing.assert_array_equal(last.top.gain, start.top.gain)
+    kept = load_controller(tmp_path / "whole" / "policy.npz")
+    assert result["score"] == official(kept, "pendubot")["score"]
+    # Stopped between two chunks, and taken up again: the same to the bit.
+    run = dataclasses.replace(run, run="stopped")
+    calls = iter([None, Stopped(signal.SIGINT)])
+
+    def stop():
+        if (now := next(calls, None)) is not None:
+            raise now
+
+    with monkeypatch.context() as patch:
+        patch.setattr("jaxpend.train.stop_if_asked", stop)
+        with pytest.raises(Stopped):
+            train(run)
+    assert train(run)["score"] == result["score"]
+    for name in ("policy.npz", "snes_last.npz"):
+        found = arrays_of(tmp_path / "stopped" / name)
+        expected = arrays_of(tmp_path / "whole" / name)
+        assert found.keys() == expected.keys()
+        for key, value in expected.items():
+            np.testing.assert_array_equal(found[key], value)
+
+
 def one_sentence(err):
     """The last line on standard error, after checking that it is the only one that complains."""
     assert "Traceback" not in err
@@ -140,6 +178,10 @@ def one_sentence(err):
         (SNESRun, "--policy {}/empty.npz", "is not a policy file, or it is empty or cut off"),
         (SNESRun, "--policy {}/cut.npz", "is not a policy file, or it is empty or cut off"),
         (SNESRun, "--snes.population 1", "population is 1"),
+        (SNESRun, "--snes.searched gain", "has no parameter 'gain'; known: layers.0.0"),
+        (TrainRun, "--snes.searched gain", "has no parameter 'gain'; known: layers.0.0"),
+        (SNESRun, "--controller foo", "unknown controller 'foo'; known: policy, policy_lqr"),
+        (SNESRun, "--controller open_loop", "OpenLoop declares no searched parameters"),
         (SACRun, "--sac.env.torque-limit 0", "torque_limit is 0.0; it must be positive"),
         (TrainRun, "--sac.env.torque-limit -3", "torque_limit is -3.0; it must be positive"),
         (TrainRun, "--robot cartpole", "unknown robot 'cartpole'; known: acrobot, pendubot"),
