@@ -32,10 +32,13 @@ def _turns(value: float, _position: int = 0) -> str:
 
 
 def _angle_axis(axis, values: np.ndarray) -> None:
-    """Ticks at half turns, turns, or less often where the arm went round and round."""
+    """Ticks at half turns, turns, or less often where the arm went round and round.
+
+    Plain radians where it hardly moved, or too far.
+    """
     turns = (values.max() - values.min()) / np.pi
     steps = [s for s in (0.5, 1, 2, 4, 10, 20, 40, 100, 200) if turns / s <= 6]
-    if steps:
+    if steps and turns > 0.75:
         axis.set_major_locator(MultipleLocator(steps[0] * np.pi))
         axis.set_major_formatter(FuncFormatter(_turns))
 

@@ -293,14 +293,18 @@ def write(runs: Sequence[Found], folder: Path, *, title: str, robustness: bool =
     }
     if shown is not None:
         best, run = judged[shown], runs[shown]
+        scores = _summary([j and j.score for j in judged])
+        robust = _summary([row["robustness"] for row in rows])
         own = [(run.name, best.score, rows[shown]["robustness"])]
+        if len(runs) > 1:  # the best of several is no fair row alone
+            own.append((f"mean of {title}", scores["mean"], robust and robust["mean"]))
         context |= {
             "best": best,
             "seconds": rows[shown]["seconds"],
             "shown": run.name,
             "window": _window(best),
-            "scores": _summary([j and j.score for j in judged]),
-            "robust": _summary([row["robustness"] for row in rows]),
+            "scores": scores,
+            "robust": robust,
             "criteria": _criteria(best),
             "six": {t: best.robustness["scores"][n] for n, t in CRITERIA.items()}
             if best.robustness

@@ -161,12 +161,14 @@ def test_seeds_keep_their_axis(tmp_path):
     assert [run.name for run in runs] == ["seed1", "seed2", "seed10"]
     path = page.write(runs, tmp_path / "out", title="many", robustness=False)
     text = path.read_text()
-    score = f"{official(load_policy('pendubot'), 'pendubot')['score']:.4f}"
+    truth = official(load_policy("pendubot"), "pendubot")["score"]
+    score = f"{truth:.4f}"
     assert cells(text, "seed10")[1] == score
     assert cells(text, "seed10")[-1] == "yes"
     assert [cells(text, "seed1")[k] for k in (1, -1)] == ["", "no"]
     for row in ("median", "interquartile mean"):
         assert cells(text, row)[1] == score
+    assert cells(text, "mean of many")[2] == f"{truth:.3f}"
     assert "seed1 is not finished" in text
     assert text.count("<option value=") == 2 + 4
 
