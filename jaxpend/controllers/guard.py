@@ -137,7 +137,7 @@ def guard(
     main: Controller,
     robot: str,
     *,
-    bandwidth: float = 500.0,
+    bandwidth: float = 800.0,
     rescue: bool = True,
     after: float = 1.6,
     radius: float = 0.6,
