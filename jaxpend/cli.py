@@ -233,7 +233,7 @@ def _configured(kind: type, args: Sequence[str]) -> tuple[type, Any, list[str]]:
         from .runs import load_config
 
         # One file serves several commands: sections that this one has no field for are passed over.
-        default = load_config(default, path, also=("policy", "sac", "snes"))
+        default = load_config(default, path, also=("policy", "sac", "guard", "snes"))
     return kind, default, rest
 
 

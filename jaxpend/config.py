@@ -15,6 +15,7 @@ __all__ = [
     "CheckpointConfig",
     "DemonstrationConfig",
     "EnvConfig",
+    "GuardConfig",
     "Reward",
     "Run",
     "SACConfig",
@@ -154,6 +155,23 @@ class SACConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class GuardConfig:
+    """What a policy is guarded with before SNES; see ``controllers.guard``. Nothing by default."""
+
+    bandwidth: float = 0.0  # rad/s, of the observer of the state from angles; 0: none
+    rescue: bool = False  # energy shaping and LQR take over a swing-up that failed
+    after: float = 1.6  # s, the time that a swing-up may take
+    radius: float = 0.6  # rad, of either angle around upright; beyond it a swing-up has failed
+
+    def __post_init__(self):
+        if self.bandwidth < 0:
+            raise JaxpendError(f"bandwidth is {self.bandwidth} rad/s; it must not be negative")
+        for name in ("after", "radius"):
+            if not getattr(self, name) > 0:
+                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
+
+
+@dataclasses.dataclass(frozen=True)
 class SNESConfig:
     """Hyperparameters of the evolution strategy."""
 
@@ -167,11 +185,12 @@ class SNESConfig:
     action_noise: float = 0.1  # of policies, standard deviation before the tanh; 0 for none
     scenarios: int = 0  # random imperfect scenarios a generation, the same for all individuals
     scenario_weight: float = 0.5  # of their mean score in the fitness, where there are any
+    validation: int = 256  # scenarios, always the same, on which candidates are compared
     chunk: int = 10  # generations per report
 
     def __post_init__(self):
         positive = ("generations", "population", "sigma", "gain_sigma", "final_sigma", "rollouts")
-        for name in (*positive, "chunk"):
+        for name in (*positive, "validation", "chunk"):
             if not getattr(self, name) > 0:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
         if not self.action_noise >= 0:
@@ -253,8 +272,9 @@ class SNESRun(Run):
 
 @dataclasses.dataclass(frozen=True)
 class TrainRun(SACRun):
-    """SAC, then SNES from its best policy."""
+    """SAC, then SNES from its best policy, guarded."""
 
+    guard: GuardConfig = dataclasses.field(default_factory=GuardConfig)
     snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
 
 

@@ -8,6 +8,7 @@ which a policy's greedy action is un-squashed, disturbed by Gaussian noise and s
 generation meet the same noise: common random numbers make the comparison fair.
 """
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -25,7 +26,10 @@ from .errors import JaxpendError
 from .randomisation import LONGEST_DELAY, sample
 from .score import performance, score_v2
 
-__all__ = ["SNESConfig", "SNESState", "evolve", "fitness", "init"]
+__all__ = ["SNESConfig", "SNESState", "evolve", "fitness", "init", "value"]
+
+# Of the scenarios on which candidates are compared: no seed of a run, and no key of the benchmark.
+VALIDATION_SEED = 2**31 - 1
 
 
 @pytree
@@ -69,6 +73,16 @@ def fitness(
     weight = config.scenario_weight
     score = (1 - weight) * score + weight * score_v2(c).mean()
     return score, diverged + jnp.sum(~jnp.isfinite(c.velocity_cost))
+
+
+def value(config: SNESConfig, controller: Controller, robot: str | None = None) -> jax.Array:
+    """What candidates are compared by: ``fitness`` without noise, and always on the same scenarios.
+
+    Those are ``config.validation`` in number, and none if the search meets none.
+    """
+    scenarios = config.validation if config.scenarios else 0
+    quiet = dataclasses.replace(config, action_noise=0.0, scenarios=scenarios)
+    return fitness(quiet, controller, jax.random.key(VALIDATION_SEED), robot)[0]
 
 
 def _strategy(config: SNESConfig, controller: Controller):

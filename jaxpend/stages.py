@@ -4,6 +4,7 @@ All arrays that a stage needs to go on are in its state, so that a checkpoint of
 checkpoint of the stage. Chunks do not depend on time, only on the configuration.
 """
 
+import dataclasses
 from functools import partial
 from typing import Any, ClassVar
 
@@ -11,9 +12,10 @@ import jax
 import jax.numpy as jnp
 
 from . import sac, snes
-from .config import SACConfig, SNESConfig
+from .config import GuardConfig, SACConfig, SNESConfig
+from .controllers.base import Controller
+from .controllers.guard import guard
 from .controllers.parameters import kinds
-from .controllers.policy import Policy
 from .score import nominal, score_v2
 
 __all__ = ["SAC", "SNES", "Imitation", "Stage"]
@@ -50,7 +52,7 @@ class Stage:
         """The next chunk of one run, or of several at the same step; states and metrics."""
         raise NotImplementedError
 
-    def judge(self, state: Any, metrics: dict) -> tuple[dict, list[tuple[Policy, float]]]:
+    def judge(self, state: Any, metrics: dict) -> tuple[dict, list[tuple[Controller, float]]]:
         """A row of metrics, and policies with their scores, the last one of training first."""
         raise NotImplementedError
 
@@ -66,7 +68,7 @@ class Stage:
         """The same state, to go on from with other random numbers."""
         return state.replace(key=jax.random.fold_in(state.key, number))
 
-    def outcome(self, state: Any, best: Policy | None) -> Any:
+    def outcome(self, state: Any, best: Controller | None) -> Any:
         """What the next stage starts from."""
         return best
 
@@ -158,22 +160,27 @@ class SAC(Stage):
 
 
 class SNES(Stage):
-    """SNES on the official score from any controller; its state is that and the search's.
+    """SNES on the official score from any controller, guarded; its state has that and the search.
 
-    Judged are the mean controller and the best individual so far, both without noise and, for the
-    metrics, on fresh noise.
+    Judged, by ``snes.value``, are the mean controller and the best individual so far; both are
+    also scored on the nominal plant and, for the metrics, on fresh noise.
     """
 
     name, title, unit, column = "snes", "SNES", "generations", "generation"
 
-    def __init__(self, config: SNESConfig, policy: Any, robot: str):
-        """``policy`` is a controller of the structure that the search starts from.
+    def __init__(
+        self, config: SNESConfig, policy: Any, robot: str, guarding: GuardConfig | None = None
+    ):
+        """``policy`` is a controller of the structure that the search starts from, before a guard.
 
         Raises ``JaxpendError`` if it has nothing to search.
         """
-        kinds(policy, config.searched)
-        self.config, self.total, self.policy = config, config.generations, policy
-        self.robot = robot
+        self.config, self.total, self.robot = config, config.generations, robot
+        self.guarded = partial(guard, robot=robot, **dataclasses.asdict(guarding or GuardConfig()))
+        shapes = jax.eval_shape(lambda p: p, policy)
+        self.policy = self.guarded(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes))
+        kinds(self.policy, config.searched)
+        self.value = jax.jit(lambda policy: snes.value(config, policy, robot))
         self.fresh_fitness = jax.jit(lambda p, key: snes.fitness(config, p, key, robot)[0])
 
         def evolve_all(policies, searches, count):
@@ -187,11 +194,15 @@ class SNES(Stage):
 
     def start(self, seed, before):
         key_init, key_fresh = self._keys(seed)
-        search = snes.init(self.config, before, key_init)
-        return {"start": before, "search": search, "fresh": key_fresh, "done": jnp.asarray(0)}
+        start = self.guarded(before)
+        return self._begin(start, key_init, key_fresh)
+
+    def _begin(self, start, key_init, key_fresh):
+        search = snes.init(self.config, start, key_init)
+        return {"start": start, "search": search, "fresh": key_fresh, "done": jnp.asarray(0)}
 
     def like(self):
-        return jax.eval_shape(lambda policy: self.start(0, policy), self.policy)
+        return jax.eval_shape(self._begin, self.policy, *self._keys(0))
 
     def policy_like(self):
         return self.policy
@@ -222,10 +233,12 @@ class SNES(Stage):
         found = {"mean": snes.mean_controller, "individual": snes.best_controller}
         for name, policy_of in found.items():
             policy = policy_of(self.config, start, search)
-            score = float(score_v2(nominal(policy, self.robot)))
-            row[f"{name}_score"] = score
+            value = score = float(score_v2(nominal(policy, self.robot)))
+            if self.config.scenarios:
+                value = float(self.value(policy))
+            row |= {f"{name}_score": score, f"{name}_value": value}
             row[f"{name}_fresh_fitness"] = self.fresh_fitness(policy, key)
-            candidates.append((policy, score))
+            candidates.append((policy, value))
         return row, candidates
 
     def note(self, row):

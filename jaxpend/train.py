@@ -13,8 +13,8 @@ import numpy as np
 from . import designs
 from .checkpoint import Checkpoints
 from .config import Run, SACRun, SNESRun, TrainRun
+from .controllers.base import Controller
 from .controllers.known import find_controller
-from .controllers.policy import Policy
 from .errors import JaxpendError
 from .files import to_json, write_atomically
 from .interrupt import Stopped, deferred, stop_if_asked
@@ -36,7 +36,7 @@ class SeedRun:
     checkpoints: Checkpoints
     stage: str = ""  # name of the stage it is in
     state: Any = None  # of the stage
-    best: Policy | None = None  # by the official score; None in a stage without policies
+    best: Controller | None = None  # by the official score; None in a stage without policies
     best_score: float = -math.inf
     best_at: int = 0
     rollbacks: int = 0
@@ -48,7 +48,7 @@ class SeedRun:
     # What of it goes into the JSON part of a checkpoint.
     PLAIN: ClassVar = ("stage", "best_score", "best_at", "rollbacks", "stage_began", "result")
 
-    def begin(self, stages: Mapping[str, Stage], start: Policy | None) -> None:
+    def begin(self, stages: Mapping[str, Stage], start: Controller | None) -> None:
         """Go on from the newest good checkpoint, or from the beginning if there is none."""
 
         def like(about):
@@ -127,7 +127,7 @@ class SeedRun:
             text += ", or to go on in this one with --on-divergence rollback"
         return text
 
-    def _keep_best(self, stage: Stage, candidates: Sequence[tuple[Policy, float]]) -> None:
+    def _keep_best(self, stage: Stage, candidates: Sequence[tuple[Controller, float]]) -> None:
         for policy, score in candidates:
             if score > self.best_score or (stage.ties and score == self.best_score):
                 self.best, self.best_score, self.best_at = policy, score, stage.done(self.state)
@@ -136,7 +136,7 @@ class SeedRun:
     def _save_best(self, stage: Stage) -> None:
         self._save(f"{stage.name}_best.npz", self.best, stage, self.best_at)
 
-    def _save(self, name: str, policy: Policy, stage: Stage, at: int) -> None:
+    def _save(self, name: str, policy: Controller, stage: Stage, at: int) -> None:
         about = {"stage": stage.name, stage.column: at, "seed": self.config.seed}
         self.folder.save(name, policy, **about)
 
@@ -203,7 +203,7 @@ def train_stage(stage: Stage, runs: Sequence[SeedRun]) -> None:
             run.leave(stage)
 
 
-def stages_of(config: Run, start: Policy | None) -> dict[str, Stage]:
+def stages_of(config: Run, start: Controller | None) -> dict[str, Stage]:
     """The stages of a configuration, by name; ``start`` is what SNES starts from if it is alone."""
     stages: list[Stage] = []
     if isinstance(config, SACRun):
@@ -212,7 +212,8 @@ def stages_of(config: Run, start: Policy | None) -> dict[str, Stage]:
         stages.append(SAC(config.sac))
         start = stages[-1].policy_like()
     if isinstance(config, SNESRun | TrainRun):
-        stages.append(SNES(config.snes, start, config.robot))
+        guarding = getattr(config, "guard", None)
+        stages.append(SNES(config.snes, start, config.robot, guarding))
     return {stage.name: stage for stage in stages}
 
 

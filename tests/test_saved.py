@@ -13,6 +13,7 @@ from jaxpend.controllers import Feedback, Nominal, load_controller, lqr, save_co
 from jaxpend.controllers.base import Memoryless
 from jaxpend.controllers.hybrid import with_lqr
 from jaxpend.controllers.known import KNOWN, build, find_controller
+from jaxpend.controllers.policy import network_in
 from jaxpend.controllers.saved import classes_of
 from jaxpend.score import official
 
@@ -46,8 +47,8 @@ def test_every_known_controller_comes_back_whole(tmp_path, name):
     same(load_controller(path, robot="pendubot"), made)
     with np.load(path, allow_pickle=False) as arrays:
         assert json.loads(str(arrays["header"]))["provenance"] == {"seed": 7}
-    # In the precision of the one who loads it; a policy is float32 wherever it is.
-    if name != "policy":
+    # In the precision of the one who loads it; a network alone is float32 wherever it is.
+    if not isinstance(made, Policy):
         with jax.enable_x64(True):
             leaves = jax.tree.leaves(load_controller(path))
             assert {str(leaf.dtype) for leaf in leaves} == {"float64"}
@@ -58,9 +59,12 @@ def test_policies_are_policy_files(tmp_path):
     save_controller(path, policy, "acrobot")
     same(load_policy(path), policy)
     same(load_controller("acrobot"), policy)
-    save_controller(path, with_lqr(policy, PLANT, "acrobot"), "acrobot")
-    with pytest.raises(JaxpendError, match="holds a controller, not a policy alone"):
-        load_policy(path)
+    hybrid = with_lqr(network_in(policy), PLANT, "acrobot")
+    save_controller(path, hybrid, "acrobot")
+    same(load_policy(path), hybrid)
+    same(network_in(load_policy(path)), network_in(policy))
+    with pytest.raises(JaxpendError, match="holds 0 neural networks; one is needed"):
+        network_in(lqr(PLANT, "acrobot"), path)
 
 
 def test_a_users_own_class_must_be_given(tmp_path):
@@ -137,7 +141,7 @@ def test_a_name_and_a_file_together(tmp_path):
     same(find_controller(None, None, PLANT, "pendubot"), load_policy("pendubot"))
     same(find_controller(None, "pd", PLANT, "pendubot"), build("pd", PLANT, "pendubot"))
     found = find_controller(path, "policy_lqr", PLANT, "pendubot")
-    same(found, with_lqr(policy, PLANT, "pendubot"))
+    same(found, with_lqr(network_in(policy), PLANT, "pendubot"))
     with pytest.raises(JaxpendError, match=r"pd is not built around a policy; leave out .*policy"):
         find_controller(path, "pd", PLANT, "pendubot")
     with pytest.raises(JaxpendError, match=r"unknown controller 'foo'; known: policy, .*tvlqr"):

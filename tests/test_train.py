@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,9 +15,9 @@ from training_runs import OPTIONS, arrays_of, rows_of
 
 from jaxpend import Policy, cli, designs, load_policy, save_policy
 from jaxpend.config import SACRun, SNESConfig, SNESRun, TrainRun
-from jaxpend.controllers import load_controller
+from jaxpend.controllers import Guarded, load_controller
 from jaxpend.controllers.known import build
-from jaxpend.controllers.policy import read_header
+from jaxpend.controllers.policy import network_in, read_header
 from jaxpend.interrupt import Stopped
 from jaxpend.score import official
 from jaxpend.train import train
@@ -76,11 +77,13 @@ def test_the_result_is_the_official_score_of_the_policy(whole_run):
     assert result["snes"]["score"] >= result["sac"]["score"]
     provenance = read_header(folder / "policy.npz")["provenance"]
     assert (provenance["seed"], provenance["score"]) == (3, result["score"])
-    # The policy is the one that SNES kept, made of the one that SAC kept.
+    # The policy is the one that SNES kept, made of the one that SAC kept, and guarded.
     for name in ("sac_best", "sac_last", "snes_best", "snes_last"):
-        assert len(load_policy(folder / f"{name}.npz").layers) == len(policy.layers) == 2
+        kept = load_policy(folder / f"{name}.npz")
+        assert isinstance(kept, Guarded) == name.startswith("snes")
+        assert len(network_in(kept).layers) == len(network_in(policy).layers) == 2
     kept = load_policy(folder / "snes_best.npz")
-    np.testing.assert_array_equal(kept.layers[0][0], policy.layers[0][0])
+    jax.tree.map(np.testing.assert_array_equal, kept, policy)
 
 
 def test_a_finished_run_is_not_trained_again(whole_run, monkeypatch, capsys):

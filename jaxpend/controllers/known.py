@@ -18,7 +18,7 @@ from .lqr import lqr
 from .mpc import free_mpc, tracking_mpc
 from .nominal import load_nominal
 from .pd import pd
-from .policy import change_policies, load_policy
+from .policy import change_policies, load_policy, network_in
 from .python import PythonLaw
 from .riccati import riccati
 from .saved import classes_of, load_controller
@@ -44,8 +44,12 @@ def _open_loop(plant: Plant, robot: str) -> Controller:
 
 KNOWN: dict[str, Known] = {
     "policy": Known("Policy", lambda plant, robot: load_policy(robot)),
+    "policy_network": Known(
+        "Policy, network alone", lambda plant, robot: network_in(load_policy(robot))
+    ),
     "policy_lqr": Known(
-        "Policy + LQR", lambda plant, robot: with_lqr(load_policy(robot), plant, robot)
+        "Policy, network + LQR",
+        lambda plant, robot: with_lqr(network_in(load_policy(robot)), plant, robot),
     ),
     "tvlqr": Known("TVLQR", lambda plant, robot: tvlqr(plant, load_nominal(robot))),
     "tvlqr_guarded": Known(
@@ -102,7 +106,7 @@ def find_controller(
     found = build(controller, plant, robot)
     if not policy:
         return found
-    given = load_policy(policy, robot=robot)
+    given = network_in(load_policy(policy, robot=robot), policy)
     found, policies = change_policies(found, lambda shipped: given)
     if not policies:
         raise JaxpendError(f"{controller} is not built around a policy; leave out {policy}")

@@ -17,6 +17,7 @@ from ..arrays import read_arrays, write_arrays
 from ..designs import ROBOTS, active_joint
 from ..errors import JaxpendError, choose
 from ..observation import Observation
+from .base import Controller
 from .parameters import WEIGHT
 
 __all__ = ["ACTIVATIONS", "Policy", "load_policy", "save_policy"]
@@ -73,6 +74,15 @@ def change_policies(controller: Any, change: Callable[[Policy], Policy]) -> tupl
     return jax.tree.unflatten(structure, changed), sum(map(is_policy, parts))
 
 
+def network_in(controller: Any, where: str | Path = "the controller") -> Policy:
+    """The one policy in a controller. Raises ``JaxpendError``, naming ``where``, if it has none."""
+    is_policy = lambda part: isinstance(part, Policy)  # noqa: E731
+    found = [part for part in jax.tree.leaves(controller, is_leaf=is_policy) if is_policy(part)]
+    if len(found) != 1:
+        raise JaxpendError(f"{where} holds {len(found)} neural networks; one is needed")
+    return found[0]
+
+
 def _header(policy: Policy, provenance: dict[str, Any]) -> dict[str, Any]:
     return {
         "format": FORMAT,
@@ -99,8 +109,6 @@ def save_policy(path: str | Path, policy: Policy, provenance: dict[str, Any] | N
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     header, arrays = read_arrays(path, "policy")
-    if header.get("kind", "policy") != "policy":
-        raise JaxpendError(f"{path} holds a {header['kind']}, not a policy alone")
     if header.get("format") != FORMAT:
         raise JaxpendError(f"{path} has policy format {header.get('format')}; this reads {FORMAT}")
     return header, arrays
@@ -117,8 +125,10 @@ def _locate(robot_or_path: str | Path) -> Path:
     return Path(str(resources.files("jaxpend").joinpath(f"policies/{robot_or_path}.npz")))
 
 
-def load_policy(robot_or_path: str | Path, *, robot: str | None = None) -> Policy:
+def load_policy(robot_or_path: str | Path, *, robot: str | None = None) -> Controller:
     """Load a policy file, or by "acrobot" / "pendubot" the policy that ships with the package.
+
+    A network alone is a ``Policy``; one that is guarded is a ``Guarded`` around it.
 
     Args:
         robot_or_path: a path, or the name of a robot.
@@ -128,6 +138,10 @@ def load_policy(robot_or_path: str | Path, *, robot: str | None = None) -> Polic
         JaxpendError: no such file, not a policy file, or the policy of the other robot.
     """
     path = _locate(robot_or_path)
+    if read_header(path).get("kind") == "controller":
+        from .saved import load_controller  # it knows all controllers, this one too
+
+        return load_controller(path, robot=robot)
     header, arrays = _read(path)
     try:
         sizes = header["layers"]
