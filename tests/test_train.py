@@ -183,7 +183,7 @@ def one_sentence(err):
         (SNESRun, "--snes.population 1", "population is 1"),
         (SNESRun, "--snes.searched gain", "has no parameter 'gain'; known: layers.0.0"),
         (TrainRun, "--snes.searched gain", "has no parameter 'gain'; known: layers.0.0"),
-        (SNESRun, "--controller foo", "unknown controller 'foo'; known: policy, policy_lqr"),
+        (SNESRun, "--controller foo", "unknown controller 'foo'; known: policy, policy_network"),
         (SNESRun, "--controller open_loop", "OpenLoop declares no searched parameters"),
         (SACRun, "--sac.env.torque-limit 0", "torque_limit is 0.0; it must be positive"),
         (TrainRun, "--sac.env.torque-limit -3", "torque_limit is -3.0; it must be positive"),
