@@ -194,16 +194,12 @@ def _draw(judged: Judged, robot: str, name: str, folder: Path) -> dict[str, list
     gif(folder / "swingup.gif", judged.t, judged.x, length, end=end)
     if judged.robustness:
         plots.write_robustness(judged.robustness, folder)
+    over_time = [f"{what} over time" for what in ("angles", "velocities", "torque", "height")]
     labels = {
-        "first": (
-            "angles over time",
-            "velocities over time",
-            "torque over time",
-            "height over time",
-        ),
-        "phase": ("phase portrait of joint 1", "phase portrait of joint 2"),
+        "first": over_time,
+        "phase": ["phase portrait of joint 1", "phase portrait of joint 2"],
+        "whole": [f"{label}, the whole run" for label in over_time],
     }
-    labels["whole"] = tuple(f"{label}, the whole run" for label in labels["first"])
     drawn = {
         part: [
             plots.svg(plots.panel(draw), f"{part}{k}", f"{title}: {labels[part][k]}")
@@ -267,7 +263,7 @@ def write(runs: Sequence[Found], folder: Path, *, title: str, robustness: bool =
     judged = [judge(run, robustness) for run in runs]
     rows = _seed_table(runs, judged)
     shown = max((k for k, j in enumerate(judged) if j), key=lambda k: judged[k].score, default=None)
-    made_by = runs[0].made_by or (judged[shown].header["provenance"] if shown is not None else {})
+    made_by = runs[0].made_by
     learning = list(_learning(runs))
     if learning:
         sheet = plots.stack([draw for _, draw in learning], columns=3, title=f"{robot}, {title}")
@@ -276,52 +272,52 @@ def write(runs: Sequence[Found], folder: Path, *, title: str, robustness: bool =
         "title": title,
         "robot": robot,
         "remarks": remarks(runs),
-        "seeds": rows if len(runs) > 1 else [],
-        "config": [{"name": n, "value": v, "default": d} for n, v, d in _changed(runs[0].config)],
-        "whole_config": _flat(runs[0].config),
-        "made_by": made_by,
         "finished": all(run.result or not run.config for run in runs),
-        "versions": {"jaxpend": __version__, "jax": jax.__version__, "numpy": np.__version__},
+        "seeds": rows if len(runs) > 1 else [],
         "stages": _stages(runs[0]) if len(runs) == 1 else {},
         "learning": [
-            (
-                stage,
-                plots.svg(plots.panel(draw), f"learning{k}", f"{stage}: {draw.keywords['title']}"),
-            )
-            for k, (stage, draw) in enumerate(learning)
+            (stage, plots.svg(plots.panel(d), f"learning{k}", f"{stage}: {d.keywords['title']}"))
+            for k, (stage, d) in enumerate(learning)
         ],
+        "config": [{"name": n, "value": v, "default": d} for n, v, d in _changed(runs[0].config)],
+        "whole_config": _flat(runs[0].config),
+        "versions": {"jaxpend": __version__, "jax": jax.__version__, "numpy": np.__version__},
     }
     if shown is not None:
-        best, run = judged[shown], runs[shown]
-        scores = _summary([j and j.score for j in judged])
-        robust = _summary([row["robustness"] for row in rows])
-        own = [(run.name, best.score, rows[shown]["robustness"])]
-        if len(runs) > 1:  # the best of several is no fair row alone
-            own.append((f"mean of {title}", scores["mean"], robust and robust["mean"]))
-        context |= {
-            "best": best,
-            "seconds": rows[shown]["seconds"],
-            "shown": run.name,
-            "window": _window(best),
-            "scores": scores,
-            "robust": robust,
-            "criteria": _criteria(best),
-            "six": {t: best.robustness["scores"][n] for n, t in CRITERIA.items()}
-            if best.robustness
-            else {},
-            "board": _board(robot, own),
-            "charts": _draw(best, robot, run.name, pictures),
-            "film": _film(runs, judged, shown),
-            "files": sorted(path.name for path in pictures.iterdir()),
-        }
-    templates = jinja2.PackageLoader("jaxpend")
+        made_by = made_by or judged[shown].header.get("provenance", {})
+        context |= _best(runs, judged, rows, shown, title)
+        context["charts"] = _draw(judged[shown], robot, runs[shown].name, pictures)
+        context["files"] = sorted(path.name for path in pictures.iterdir())
     page = jinja2.Environment(
-        loader=templates, autoescape=True, trim_blocks=True, lstrip_blocks=True,
-        undefined=jinja2.ChainableUndefined,
+        loader=jinja2.PackageLoader("jaxpend"), autoescape=True, trim_blocks=True,
+        lstrip_blocks=True, undefined=jinja2.ChainableUndefined,
     ).get_template("report.html")  # fmt: skip
     path = folder / "report.html"
-    write_atomically(path, page.render(context))
+    write_atomically(path, page.render(context, made_by=made_by))
     return path
+
+
+def _best(runs, judged, rows, shown: int, title: str) -> dict[str, Any]:
+    """What the page says where there is a policy: about the best one, and about all."""
+    best, run = judged[shown], runs[shown]
+    scores = _summary([j and j.score for j in judged])
+    robust = _summary([row["robustness"] for row in rows])
+    own = [(run.name, best.score, rows[shown]["robustness"])]
+    if len(runs) > 1:  # the best of several is no fair row alone
+        own.append((f"mean of {title}", scores["mean"], robust and robust["mean"]))
+    six = best.robustness["scores"] if best.robustness else {}
+    return {
+        "best": best,
+        "shown": run.name,
+        "seconds": rows[shown]["seconds"],
+        "window": _window(best),
+        "scores": scores,
+        "robust": robust,
+        "criteria": _criteria(best),
+        "six": {CRITERIA[name]: share for name, share in six.items()},
+        "board": _board(run.robot, own),
+        "film": _film(runs, judged, shown),
+    }
 
 
 def _film(runs: Sequence[Found], judged: Sequence[Judged | None], shown: int) -> dict[str, Any]:
