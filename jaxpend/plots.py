@@ -137,8 +137,11 @@ def _bars(axes, result: dict[str, Any], first: bool) -> None:
     axes.set_title(result["robot"], loc="center")
 
 
-def _strips(axes, result: dict[str, Any], first: bool) -> Any:
-    """One row a grid: every value coloured by the fraction of its runs that succeed."""
+def _strips(axes, result: dict[str, Any], first: bool, margin: float = 0.18) -> Any:
+    """One row a grid: every value coloured by the fraction of its runs that succeed.
+
+    ``margin`` is the room for the ends of a grid, in widths of a row.
+    """
     rows = [
         (name, grid)
         for criterion in CRITERIA
@@ -157,10 +160,10 @@ def _strips(axes, result: dict[str, Any], first: bool) -> Any:
             if random_series
             else (f"{values[0]:.3g}", f"{values[-1]:.3g}")
         )
-        small = {"va": "center", "fontsize": "x-small", "color": PALETTE["muted"]}
+        small = {"va": "center", "fontsize": 9, "color": PALETTE["muted"]}
         axes.text(-0.015, y, ends[0], ha="right", **small)
         axes.text(1.015, y, ends[1], ha="left", **small)
-    axes.set_xlim(-0.18, 1.2)
+    axes.set_xlim(-margin, 1 + 1.1 * margin)
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_xticks([])
     labels = [_label(name) for name, _ in rows]
@@ -202,8 +205,8 @@ def robustness_figure(results: Sequence[dict[str, Any]]) -> Figure:
 @styled
 def strips_figure(result: dict[str, Any]) -> Figure:
     """Success along every grid of one result, no wider than a phone."""
-    figure = Figure(figsize=(5.4, 5.6), layout="constrained")
-    _success_bar(figure, _strips(figure.add_subplot(), result, first=True))
+    figure = Figure(figsize=(4.4, 6), layout="constrained")
+    _success_bar(figure, _strips(figure.add_subplot(), result, first=True, margin=0.38))
     return figure
 
 

@@ -357,7 +357,7 @@ def test_a_phone_shows_all_of_it_legibly(made, tab, theme):
     assert tab.value("[innerWidth, document.documentElement.scrollWidth]") == [390, 390]
     tab.value("document.querySelectorAll('details').forEach(e => { e.open = true; })")
     # The smallest text of a chart, in pixels; tables fit without scrolling.
-    sizes = """[...document.querySelectorAll('.charts svg text')].map(
+    sizes = """[...document.querySelectorAll('figure svg text')].map(
         text => { const m = text.getScreenCTM();
             return parseFloat(getComputedStyle(text).fontSize) * Math.hypot(m.a, m.b); })"""
     sizes = tab.value(sizes)
