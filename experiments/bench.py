@@ -57,12 +57,12 @@ def show(name: str, times: tuple[float, float, float], speed: str = "") -> None:
 
 
 def bench_seeds(count: int = 4) -> None:
-    """What a vmap over seeds brings: the recipe of the pendubot, chunks as in training."""
+    """What a vmap over seeds brings, in the recipe of the pendubot."""
     recipe = load_config(TrainRun(), Path(__file__).parent / "pendubot.yaml")
-    # Imitation is not timed, and what is learned does not matter: few demonstrations will do.
+    # Imitation is not timed: a few demonstrations will do.
     shown = dataclasses.replace(recipe.sac.demonstrations, episodes=20, updates=1)
-    config = dataclasses.replace(recipe.sac, demonstrations=shown, actor_delay=0)
-    search = SNES(recipe.snes, random_policy(64), recipe.robot)
+    config = dataclasses.replace(recipe.sac, demonstrations=shown, eval_every=3200)
+    search = SNES(dataclasses.replace(recipe.snes, chunk=2), random_policy(64), recipe.robot)
     training = SAC(config)
     keys = [jax.random.key(seed) for seed in range(count)]
     parts = {

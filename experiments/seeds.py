@@ -63,7 +63,8 @@ def train(recipe: str, robot: str, seed: int, runs: Path) -> dict:
         if done.returncode:
             raise SystemExit(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
     result = json.loads((folder / "result.json").read_text())
-    first = json.loads((folder / "metrics.jsonl").read_text().splitlines()[0])
+    rows = map(json.loads, (folder / "metrics.jsonl").read_text().splitlines())
+    first = next(row for row in rows if row["stage"] == "sac")
     keys = ("score", "success", "seconds")
     return {
         "recipe": recipe,
