@@ -22,41 +22,38 @@ ROBOTS = ("acrobot", "pendubot")
 # What a recipe changes of the robot's own; "plain" has a file of its own.
 RECIPES = {
     "shipped": [],
-    "calm": [  # demonstrations as they were first: no pulses, half the torque
-        "--sac.env.torque-limit", "3", "--sac.demonstrations.pulses", "0",
-        "--sac.demonstrations.duration", "4", "--sac.demonstrations.updates", "20000",
-    ],
+    "no guard": ["--guard.bandwidth", "0", "--guard.rescue", "no"],
+    "no observer": ["--guard.bandwidth", "0"],
+    "no rescue": ["--guard.rescue", "no"],
+    "no pulses": ["--sac.demonstrations.pulses", "0"],
+    "no SAC": ["--sac.steps", "32"],  # fewer than the actor's delay: imitation alone
+    "robust SNES": ["--snes.scenarios", "16", "--snes.generations", "60"],
     "plain": [],
-}  # fmt: skip
+}
 # One thread a run: two runs side by side use two cores better than one run does.
 THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 
 def robustness(robot: str, policy: Path) -> dict:
-    """Overall robustness of a policy over five benchmark keys: median, lowest, highest."""
+    """Robustness of a policy over five benchmark keys: median, lowest, highest; six criteria."""
     command = [sys.executable, "-m", "jaxpend.robustness", "--robot", robot, "--out", "None"]
     command += ["--policy", str(policy), "--keys", "5", "--json", "-"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    overall = json.loads(done.stdout)["over_keys"]["overall"]
-    return {"median": float(np.median(overall)), "lowest": min(overall), "highest": max(overall)}
+    found = json.loads(done.stdout)
+    overall, by_key = (found["over_keys"][name] for name in ("overall", "scores"))
+    criteria = {n: float(np.median(by_key.get(n, [v]))) for n, v in found["scores"].items()}
+    ends = {"lowest": min(overall), "highest": max(overall)}
+    return {"median": float(np.median(overall))} | ends | {"criteria": criteria}
 
 
 def train(recipe: str, robot: str, seed: int, runs: Path) -> dict:
     """One run of `python -m jaxpend.train`; returns a row of the table."""
-    folder = runs / f"{recipe}-{robot}-{seed}"
+    folder = runs / f"{recipe}-{robot}-{seed}".replace(" ", "-")
     if not (folder / "result.json").exists():
         config = HERE / f"{recipe if recipe == 'plain' else robot}.yaml"
         command = [sys.executable, "-m", "jaxpend.train", "--config", str(config)]
-        command += [
-            "--robot",
-            robot,
-            "--seed",
-            str(seed),
-            "--runs",
-            str(runs),
-            "--run",
-            folder.name,
-        ]
+        command += ["--robot", robot, "--seed", str(seed)]
+        command += ["--runs", str(runs), "--run", folder.name]
         command += RECIPES[recipe]
         environment = os.environ | {"XLA_FLAGS": THREAD}
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
@@ -78,10 +75,10 @@ def train(recipe: str, robot: str, seed: int, runs: Path) -> dict:
     }
 
 
-def table(rows: list[dict]) -> str:
+def table(rows: list[dict], jobs: int) -> str:
     """A Markdown table, a row each, and the median and range of each group."""
     lines = [
-        f"Machine: {platform.machine()}, {os.cpu_count()} cores; two single-threaded runs at once; "
+        f"Machine: {platform.machine()}, {os.cpu_count()} cores; single-threaded runs, {jobs} at once; "
         "robustness: median (range) over 5 benchmark keys.",
         "",
         "| recipe | robot | seed | imitation | then SAC | then SNES | robustness | SAC | SNES |",
@@ -124,8 +121,8 @@ def main() -> None:
     with concurrent.futures.ThreadPoolExecutor(args.jobs) as pool:
         rows = list(pool.map(lambda job: train(*job), jobs))
     (HERE / f"{args.out}.json").write_text(json.dumps(rows, indent=1) + "\n")
-    (HERE / f"{args.out}.md").write_text(table(rows))
-    print(table(rows))
+    (HERE / f"{args.out}.md").write_text(table(rows, args.jobs))
+    print(table(rows, args.jobs))
 
 
 if __name__ == "__main__":

@@ -180,7 +180,7 @@ class SNESConfig:
     sigma: float = 0.01  # initial standard deviation of a network's weights
     gain_sigma: float = 0.05  # of the logarithm of all else: a fraction
     final_sigma: float = 1.0  # sigma decays geometrically to this fraction of itself
-    searched: str = "all"  # of what is declared; "hidden": no output layers; or "top,region.inner"
+    searched: str = "all"  # or "weights" of networks, "hidden" layers, "top,region.inner"
     rollouts: int = 1  # noisy rollouts per individual
     action_noise: float = 0.1  # of policies, standard deviation before the tanh; 0 for none
     scenarios: int = 0  # random imperfect scenarios a generation, the same for all individuals

@@ -49,6 +49,7 @@ TRACKING = TVLQR(SWINGUP, jnp.ones((STEPS, 4)), lqr(PLANT, "acrobot"))
         (POLICY, "all", paths("", 0, 1)),
         (POLICY, "hidden", paths("", 0)),
         (HYBRID, "all", paths("swingup.", 0, 1) | SWITCHED),
+        (HYBRID, "weights", paths("swingup.", 0, 1)),
         (HYBRID, "hidden", paths("swingup.", 0) | SWITCHED),
         (HYBRID, "swingup, region.inner", paths("swingup.", 0, 1) | {"region.inner": FACTOR}),
         (HYBRID, "region.goal", {"region.goal": FACTOR}),

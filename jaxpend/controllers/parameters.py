@@ -21,6 +21,8 @@ from ..errors import JaxpendError
 
 __all__ = ["FACTOR", "KNOTS", "OVER_TIME", "WEIGHT", "coordinates", "kinds"]
 
+# What ``searched`` may be besides key paths.
+WHOLE = ("all", "weights", "hidden")
 WEIGHT, FACTOR, OVER_TIME = "weight", "factor", "over time"
 # Of ``OVER_TIME``, evenly spaced: a thousand independent gains would be searched in vain.
 KNOTS = 16
@@ -53,10 +55,10 @@ def kinds(controller: Any, searched: str = "all") -> dict[str, str]:
 
     Args:
         controller: any pytree.
-        searched: "all" that its classes declare, "hidden" for that without the output layers of
-            policies, or key paths separated by commas. A part, such as ``top`` or
-            ``swingup.layers``, stands for what is declared in it, and for all of it where
-            nothing is; what no class declares is a ``FACTOR``.
+        searched: "all" that its classes declare, "weights" for what of that is a ``WEIGHT``,
+            "hidden" for all but the output layers of policies, or key paths separated by commas.
+            A part, such as ``top`` or ``swingup.layers``, stands for what is declared in it, and
+            for all of it where nothing is; what no class declares is a ``FACTOR``.
 
     Raises:
         JaxpendError: nothing of that name, or nothing declared.
@@ -66,8 +68,10 @@ def kinds(controller: Any, searched: str = "all") -> dict[str, str]:
     said = _declared(controller, searched == "hidden")
     declared = {p: kind for p in leaves for name, kind in said.items() if _is_under(p, name)}
     names = [name.strip() for name in searched.split(",")]
-    found = declared if searched in ("all", "hidden") else {}
-    for name in () if searched in ("all", "hidden") else names:
+    found = declared if searched in WHOLE else {}
+    if searched == "weights":
+        found = {path: kind for path, kind in declared.items() if kind == WEIGHT}
+    for name in () if searched in WHOLE else names:
         below = [p for p in leaves if _is_under(p, name)]
         if not below:
             known = ", ".join(leaves)
