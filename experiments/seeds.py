@@ -78,8 +78,8 @@ def train(recipe: str, robot: str, seed: int, runs: Path) -> dict:
 def table(rows: list[dict], jobs: int) -> str:
     """A Markdown table, a row each, and the median and range of each group."""
     lines = [
-        f"Machine: {platform.machine()}, {os.cpu_count()} cores; single-threaded runs, {jobs} at once; "
-        "robustness: median (range) over 5 benchmark keys.",
+        f"Machine: {platform.machine()}, {os.cpu_count()} cores; single-threaded runs, {jobs} at "
+        "once; robustness: median (range) over 5 benchmark keys.",
         "",
         "| recipe | robot | seed | imitation | then SAC | then SNES | robustness | SAC | SNES |",
         "|---|---|---|---|---|---|---|---|---|",
