@@ -175,6 +175,7 @@ class GuardConfig:
 class SNESConfig:
     """Hyperparameters of the evolution strategy."""
 
+    strategy: str = "snes"  # or sep_cma_es, lm_ma_es, open_es
     generations: int = 400
     population: int = 40
     sigma: float = 0.01  # initial standard deviation of a network's weights
@@ -197,8 +198,11 @@ class SNESConfig:
             raise JaxpendError(f"action_noise is {self.action_noise}; it must not be negative")
         if self.scenarios < 0 or not 0 <= self.scenario_weight <= 1:
             raise JaxpendError("scenarios must not be negative, scenario_weight lies in 0 to 1")
+        choose("strategy", self.strategy, ("snes", "sep_cma_es", "lm_ma_es", "open_es"))
         if self.population < 2:
             raise JaxpendError("population is 1; SNES compares at least two individuals")
+        if self.strategy == "open_es" and self.population % 2:
+            raise JaxpendError(f"population is {self.population}; open_es needs pairs")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,7 +5,8 @@ policy, or from any other controller that declares what may be searched (``param
 fitness of an individual is its official v2 score (10 s at 500 Hz), averaged over rollouts in
 which a policy's greedy action is un-squashed, disturbed by Gaussian noise and squashed again
 (Calì et al., 2024), so that what is found stands on wide ground. All individuals of a
-generation meet the same noise: common random numbers make the comparison fair.
+generation meet the same noise: common random numbers make the comparison fair. Other strategies of
+evosax stand behind the same options.
 """
 
 import dataclasses
@@ -14,7 +15,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from evosax.algorithms import SNES
+import optax
+from evosax.algorithms import LM_MA_ES, SNES, Open_ES, Sep_CMA_ES
 
 from . import designs
 from ._struct import pytree
@@ -28,6 +30,12 @@ from .score import performance, score_v2
 
 __all__ = ["SNESConfig", "SNESState", "evolve", "fitness", "init", "value"]
 
+STRATEGIES = {
+    "snes": SNES,
+    "sep_cma_es": Sep_CMA_ES,
+    "lm_ma_es": LM_MA_ES,
+    "open_es": Open_ES,
+}
 # Of the scenarios on which candidates are compared: no seed of a run, and no key of the benchmark.
 VALIDATION_SEED = 2**31 - 1
 
@@ -36,7 +44,7 @@ VALIDATION_SEED = 2**31 - 1
 class SNESState:
     """Everything that the search changes."""
 
-    strategy: Any  # evosax state: mean and std (parameters,), generation counter
+    strategy: Any  # evosax state: mean and std, in units of ``_Search``, generation counter
     key: jax.Array
     best: jax.Array  # (parameters,) best individual by noisy fitness
     best_fitness: jax.Array  # () its noisy fitness, a score
@@ -85,18 +93,43 @@ def value(config: SNESConfig, controller: Controller, robot: str | None = None) 
     return fitness(quiet, controller, jax.random.key(VALIDATION_SEED), robot)[0]
 
 
-def _strategy(config: SNESConfig, controller: Controller):
-    flat, weights, rebuild = coordinates(controller, config.searched)
-    return SNES(population_size=config.population, solution=flat), flat, weights, rebuild
+class _Search:
+    """The strategy of a configuration on the coordinates of a controller.
+
+    Only SNES takes a standard deviation for each coordinate. The others search in units of it:
+    coordinate = ``unit`` z.
+    """
+
+    def __init__(self, config: SNESConfig, controller: Controller):
+        flat, weights, self._rebuild = coordinates(controller, config.searched)
+        std = jnp.where(weights, config.sigma, config.gain_sigma).astype(flat.dtype)
+        shrunk = lambda generation: config.final_sigma ** (generation / config.generations)  # noqa: E731
+        # Its mean moves by a tenth of sigma a generation; its sigma follows a schedule only.
+        options = {"optimizer": optax.adam(0.1), "std_schedule": shrunk}
+        options = options if config.strategy == "open_es" else {}
+        self.decay = 1.0 if options else config.final_sigma ** (1.0 / config.generations)
+        per_coordinate = config.strategy == "snes"
+        self.unit = jnp.ones((), flat.dtype) if per_coordinate else std
+        self.start = flat / self.unit
+        kind = STRATEGIES[config.strategy]
+        self.strategy = kind(population_size=config.population, solution=flat, **options)
+        with jax.ensure_compile_time_eval():  # LM-MA-ES turns a number of vectors into an int
+            self.params = self.strategy.default_params
+        if hasattr(self.params, "std_init"):
+            first = std if per_coordinate else jnp.ones((), flat.dtype)
+            self.params = self.params.replace(std_init=first)
+
+    def rebuild(self, z: jax.Array) -> Controller:
+        """The controller at ``z``."""
+        return self._rebuild(self.unit * z)
 
 
 def init(config: SNESConfig, controller: Controller, key: jax.Array) -> SNESState:
     """Search distribution centred on the controller. Raises as ``parameters.kinds``."""
-    strategy, flat, weights, _ = _strategy(config, controller)
+    search = _Search(config, controller)
     key, key_init = jax.random.split(key)
-    std = jnp.where(weights, config.sigma, config.gain_sigma).astype(flat.dtype)
-    state = strategy.init(key_init, flat, strategy.default_params.replace(std_init=std))
-    return SNESState(state, key, flat, jnp.asarray(-jnp.inf), jnp.zeros((), jnp.int32))
+    state = search.strategy.init(key_init, search.start, search.params)
+    return SNESState(state, key, search.start, jnp.asarray(-jnp.inf), jnp.zeros((), jnp.int32))
 
 
 @partial(jax.jit, static_argnames=("config", "generations", "robot"))
@@ -112,18 +145,17 @@ def evolve(
     ``start`` is what ``init`` got: the origin of the coordinates, and all that is not searched.
     ``robot`` is as in ``fitness``.
     """
-    strategy, *_, rebuild = _strategy(config, start)
-    params = strategy.default_params
-    decay = config.final_sigma ** (1.0 / config.generations)
+    search = _Search(config, start)
+    strategy, params = search.strategy, search.params
 
     def generation(state, _):
         key, key_ask, key_noise, key_tell = jax.random.split(state.key, 4)
         population, inner = strategy.ask(key_ask, state.strategy, params)
-        judge = lambda p: fitness(config, rebuild(p), key_noise, robot)  # noqa: E731
+        judge = lambda p: fitness(config, search.rebuild(p), key_noise, robot)  # noqa: E731
         scores, diverged = jax.vmap(judge)(population)
         # The one place that negates: evosax minimises.
         inner, _ = strategy.tell(key_tell, population, -scores, inner, params)
-        inner = inner.replace(std=inner.std * decay)
+        inner = inner.replace(std=inner.std * search.decay)
         top = jnp.argmax(scores)
         better = scores[top] > state.best_fitness
         state = SNESState(
@@ -134,19 +166,19 @@ def evolve(
             diverged=state.diverged + diverged.sum(),
         )
         metrics = {"mean_fitness": scores.mean(), "max_fitness": scores[top]}
-        return state, metrics | {"sigma": inner.std.mean()}
+        return state, metrics | {"sigma": (search.unit * inner.std).mean()}
 
     return jax.lax.scan(generation, state, length=generations)
 
 
 def mean_controller(config: SNESConfig, start: Controller, state: SNESState) -> Controller:
     """The controller at the centre of the search distribution."""
-    return coordinates(start, config.searched)[-1](state.strategy.mean)
+    return _Search(config, start).rebuild(state.strategy.mean)
 
 
 def best_controller(config: SNESConfig, start: Controller, state: SNESState) -> Controller:
     """The individual with the best noisy fitness so far."""
-    return coordinates(start, config.searched)[-1](state.best)
+    return _Search(config, start).rebuild(state.best)
 
 
 if __name__ == "__main__":

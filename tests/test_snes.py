@@ -44,9 +44,27 @@ def evolved(config, policy, generations):
     return snes.evolve(config, policy, snes.init(config, policy, KEY), generations)
 
 
-def test_the_search_climbs_the_fitness(toy_fitness):
-    config = SNESConfig(generations=40, population=20, sigma=0.03)
-    state, _ = evolved(config, TOY, 40)
+@pytest.mark.parametrize("strategy", list(snes.STRATEGIES))
+def test_every_strategy_starts_at_the_controller_and_shrinks_as_told(toy_fitness, strategy):
+    config = SNESConfig(
+        generations=4, population=6, sigma=0.02, gain_sigma=0.05, final_sigma=1e-3,
+        strategy=strategy,
+    )  # fmt: skip
+    start = TOY.replace(layers=jax.tree.map(lambda leaf: leaf + 0.3, TOY.layers))
+    state = snes.init(config, start, KEY)
+    for centre in (snes.mean_controller, snes.best_controller):
+        jax.tree.map(assert_close, centre(config, start, state), start)
+    state, metrics = snes.evolve(config, start, state, 4)
+    # From 0.02 to a thousandth of it; they adapt sigma as well, and Open-ES is a generation late.
+    assert 2e-6 < metrics["sigma"][-1] < 2e-4
+
+
+@pytest.mark.parametrize("strategy", list(snes.STRATEGIES))
+def test_the_search_climbs_the_fitness(toy_fitness, strategy):
+    # Open-ES moves by a tenth of sigma a generation.
+    generations = 100 if strategy == "open_es" else 40
+    config = SNESConfig(generations=generations, population=20, sigma=0.03, strategy=strategy)
+    state, _ = evolved(config, TOY, generations)
     found = snes.mean_controller(config, TOY, state)
     assert distance(found) < 0.2 * distance(TOY)
     assert np.mean(np.asarray(found.layers[0][0])) > 0.05
@@ -221,6 +239,8 @@ def test_a_generation_meets_one_noise_and_improves_the_policy(imitation, fit):
         ({"action_noise": -0.1}, "action_noise is -0.1; it must not be negative"),
         ({"action_noise": float("nan")}, "action_noise is nan; it must not be negative"),
         ({"gain_sigma": 0.0}, "gain_sigma is 0.0; it must be positive"),
+        ({"strategy": "ga"}, "unknown strategy 'ga'; known: snes, sep_cma_es"),
+        ({"strategy": "open_es", "population": 5}, "population is 5; open_es needs pairs"),
         ({"scenarios": -1}, "scenarios must not be negative"),
         ({"scenario_weight": 1.5}, "scenario_weight lies in 0 to 1"),
     ],
