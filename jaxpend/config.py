@@ -16,6 +16,7 @@ __all__ = [
     "DemonstrationConfig",
     "EnvConfig",
     "GuardConfig",
+    "GradientConfig",
     "Reward",
     "Run",
     "SACConfig",
@@ -215,6 +216,36 @@ class CheckpointConfig:
     def __post_init__(self):
         if not (self.every >= 0 and self.keep >= 1):
             raise JaxpendError("checkpoint: every must not be negative, keep must be positive")
+
+
+@dataclasses.dataclass(frozen=True)
+class GradientConfig:
+    """Hyperparameters of the ascent by the gradient through the simulator."""
+
+    steps: int = 1000  # of Adam
+    learning_rate: float = 1e-4  # of a network's weights
+    gain_learning_rate: float = 1e-3  # of the logarithm of all else: a fraction
+    final_learning_rate: float = 0.01  # cosine decay to this fraction of learning_rate
+    duration: float = 3.0  # s of the nominal run; afterwards a good policy stands still
+    clip: float = 0.1  # norm of the gradient of one run
+    searched: str = "all"  # as in SNESConfig
+    line_width: float = 0.005  # m, over which the line is blurred
+    power_width: float = 0.01  # W, over which the kink of |power| is rounded
+    scenarios: int = 0  # random imperfect scenarios a step
+    scenario_duration: float = 4.0  # s
+    scenario_weight: float = 0.8  # of them in what is climbed, where there are any
+    memory: float = 1.0  # s, with which their gradient fades back in time; inf: it does not
+    chunk: int = 20  # steps per report
+
+    def __post_init__(self):
+        for name in (
+            "steps", "learning_rate", "gain_learning_rate", "final_learning_rate", "duration",
+            "clip", "memory", "line_width", "power_width", "scenario_duration", "chunk",
+        ):  # fmt: skip
+            if not getattr(self, name) > 0:
+                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
+        if self.scenarios < 0 or not 0 <= self.scenario_weight <= 1:
+            raise JaxpendError("scenarios must not be negative, scenario_weight lies in 0 to 1")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,8 @@ Sums over the horizon stand for the criteria of ``jaxpend.score``:
 and the objective is the mean of ``tanh(pi c_i / n_i)`` plus a final cost that lands upright.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +23,7 @@ from ._struct import pytree, static
 from .ilqr import Problem
 from .plant import Plant, forward_kinematics, rk4_step
 
-__all__ = ["SwingUp", "problem", "step"]
+__all__ = ["SwingUp", "problem", "smooth_score", "step", "totals"]
 
 OFFICIAL_DT, OFFICIAL_STEPS = 0.002, 5000
 CRITERIA = ("swingup_time", "energy", "tau_cost", "tau_smoothness", "velocity_cost")
@@ -55,6 +57,23 @@ def _features(p: SwingUp, k: jax.Array, z: jax.Array, u: jax.Array) -> jax.Array
     change_sum = change**2 * (p.dt / OFFICIAL_DT)
     speed = z[2] ** 2 + z[3] ** 2
     return jnp.stack([p.dt * below, p.dt * power, p.dt * u**2, change_sum, p.dt * speed])
+
+
+def totals(p: SwingUp, x: jax.Array, u: jax.Array) -> jax.Array:
+    """The sums of a run in steps of ``p.dt``, (5,), in the order of ``CRITERIA``.
+
+    Args:
+        p: only plant, widths, joint and dt are looked at.
+        x: (N + 1, 4) or (N, 4) states; one after the last torque is dropped.
+        u: (N,) N m, torques of the driven joint.
+    """
+    z = jnp.concatenate([x[: len(u)], jnp.pad(u, (1, 0))[:-1, None]], axis=1)
+    return jax.vmap(partial(_features, p))(jnp.arange(len(u)), z, u).sum(axis=0)
+
+
+def smooth_score(p: SwingUp, totals: jax.Array) -> jax.Array:
+    """Smooth form of the official v2 score, of ``totals`` (5,); success is not asked for."""
+    return 1 - _outer(p, totals)
 
 
 def _outer(p: SwingUp, totals: jax.Array) -> jax.Array:

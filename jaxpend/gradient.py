@@ -1,0 +1,162 @@
+"""The analytic gradient of a smooth form of the official score, through the simulator.
+
+The closed loop is differentiated from end to end: what a parameter does to the score seconds
+later is known, not sampled. Adam (Kingma and Ba, 2015) climbs from a trained policy, or from any
+other controller that declares what may be searched (``controllers/parameters.py``),
+
+    (1 - w) smooth v2 score of the nominal run + w mean upright time of random scenarios
+
+The first is that of ``swingup.py``. The second is there only with ``config.scenarios``: the mean
+over a run and over imperfect scenarios (``randomisation.sample``, new ones every step) of
+``1 / (1 + d^2)``, d the distance to upright in units of what the benchmark calls a success.
+
+Where motion is chaotic the gradient explodes and says nothing. Therefore the window is
+``duration`` long, the norm of each run's gradient is clipped before they are averaged, a run
+whose gradient is not finite is left out and counted, and in scenarios what a state does to later
+ones fades from the gradient (``memory``).
+"""
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from . import designs
+from ._struct import pytree
+from .config import GradientConfig
+from .controllers.base import Controller
+from .controllers.parameters import coordinates
+from .plant import rk4_step
+from .randomisation import LONGEST_DELAY, sample
+from .rollout import rollout
+from .scenario import Scenario
+from .sweep import EPSILON
+from .swingup import SwingUp, smooth_score, totals
+
+__all__ = ["GradientConfig", "GradientState", "current", "improve", "init", "slope"]
+
+DT = 0.002  # s, the official one: smoothness and delay are counted in its steps
+
+
+@pytree
+class GradientState:
+    """Everything that the ascent changes."""
+
+    parameters: jax.Array  # (parameters,)
+    optimizer: Any  # optax state
+    key: jax.Array
+    lost: jax.Array  # () int, runs whose gradient was not finite, so far
+
+
+def _fading(memory: float):
+    """``rk4_step``, across which a gradient fades with time constant ``memory`` (s)."""
+
+    def integrate(plant, x, u, dt):
+        x = rk4_step(plant, x, u, dt)
+        held = jax.lax.stop_gradient(x)
+        return held + math.exp(-dt / memory) * (x - held)
+
+    return rk4_step if math.isinf(memory) else integrate
+
+
+def performance(config: GradientConfig, controller: Controller, robot: str) -> jax.Array:
+    """Smooth v2 score of the first ``config.duration`` s of the nominal run."""
+    plant, joint = designs.competition(robot), designs.active_joint(robot)
+    run = rollout(plant, controller, jax.random.key(0), dt=DT, duration=config.duration)
+    width = jnp.asarray(config.line_width), jnp.asarray(config.power_width)
+    p = SwingUp(plant, None, None, *width, joint=joint, dt=DT)
+    return smooth_score(p, totals(p, run.x, run.u[:, joint]))
+
+
+def uprightness(x: jax.Array) -> jax.Array:
+    """``1 / (1 + d^2)`` of states (..., 4), d the distance to upright in units of ``EPSILON``."""
+    off = jnp.stack([2 * (1 + jnp.cos(x[..., 0])), 2 * (1 - jnp.cos(x[..., 1]))], axis=-1)
+    off = jnp.concatenate([off, x[..., 2:] ** 2], axis=-1)
+    return 1 / (1 + jnp.sum(off / jnp.asarray(EPSILON, x.dtype) ** 2, axis=-1))
+
+
+def robustness(config: GradientConfig, controller, scenario: Scenario, key) -> jax.Array:
+    """Mean uprightness of a run of ``config.scenario_duration`` s; ``key`` is consumed."""
+    slots, integrator = LONGEST_DELAY + 1, _fading(config.memory)
+    options = {"duration": config.scenario_duration, "integrator": integrator}
+    run = rollout(scenario, controller, key, dt=DT, delay_slots=slots, **options)
+    return uprightness(run.x).mean()
+
+
+def _usable(config: GradientConfig, value, slope):
+    """Value and clipped gradient of a run, zero if they are not finite, and whether they are."""
+    norm = jnp.linalg.norm(slope)
+    finite = jnp.isfinite(value) & jnp.isfinite(norm)
+    scale = jnp.minimum(1.0, config.clip / jnp.where(norm > 0, norm, 1.0))
+    return jnp.where(finite, value, 0.0), jnp.where(finite, scale * slope, 0.0), finite
+
+
+def slope(config: GradientConfig, start: Controller, robot: str, z: jax.Array, key: jax.Array):
+    """Gradient (n,) at the coordinates ``z`` (n,), how many runs were lost, and metrics.
+
+    ``start`` is the origin of the coordinates; ``key`` is consumed.
+    """
+    rebuild = coordinates(start, config.searched)[-1]
+    found = jax.value_and_grad(lambda z: performance(config, rebuild(z), robot))(z)
+    value, ascent, finite = _usable(config, *found)
+    lost, metrics = 1 - finite.astype(jnp.int32), {"smooth_score": value}
+    if not config.scenarios:
+        return ascent, lost, metrics
+    plant = designs.competition(robot)
+    keys = jax.random.split(key, 2 * config.scenarios)
+    scenarios = jax.vmap(lambda k: sample(plant, k))(keys[: config.scenarios])
+    each = jax.value_and_grad(lambda z, s, k: robustness(config, rebuild(z), s, k))
+    found = jax.vmap(each, in_axes=(None, 0, 0))(z, scenarios, keys[config.scenarios :])
+    values, ascents, finite = jax.vmap(partial(_usable, config))(*found)
+    weight, kept = config.scenario_weight, jnp.maximum(finite.sum(), 1)
+    ascent = (1 - weight) * ascent + weight * ascents.sum(axis=0) / kept
+    lost = lost + jnp.sum(~finite, dtype=jnp.int32)
+    return ascent, lost, metrics | {"uprightness": values.sum() / kept}
+
+
+def _adam(config: GradientConfig, weights: np.ndarray) -> optax.GradientTransformation:
+    """Adam, warmed up, then with cosine decay; weights and all else have step sizes of their own.
+
+    Its first steps are as long as all others whatever the gradient: cold, they fell off a cliff.
+    """
+    rates = np.where(weights, config.learning_rate, config.gain_learning_rate)
+    decay = optax.warmup_cosine_decay_schedule(
+        0.0, 1.0, config.steps // 10, config.steps, config.final_learning_rate
+    )
+    sizes = optax.stateless(lambda change, _: change * rates.astype(change.dtype))
+    return optax.chain(optax.scale_by_adam(), optax.scale_by_schedule(decay), sizes)
+
+
+def init(config: GradientConfig, controller: Controller, key: jax.Array) -> GradientState:
+    """At the controller, before the first step. Raises as ``parameters.kinds``."""
+    z, weights, _ = coordinates(controller, config.searched)
+    return GradientState(z, _adam(config, weights).init(z), key, jnp.zeros((), jnp.int32))
+
+
+@partial(jax.jit, static_argnames=("config", "steps", "robot"))
+def improve(
+    config: GradientConfig, start: Controller, state: GradientState, steps: int, robot: str
+):
+    """Some Adam steps; returns the state and metrics of each step (steps,).
+
+    ``start`` is what ``init`` got: the origin of the coordinates, and all that is not searched.
+    """
+    optimizer = _adam(config, coordinates(start, config.searched)[1])
+
+    def step(state, _):
+        key, key_now = jax.random.split(state.key)
+        ascent, lost, metrics = slope(config, start, robot, state.parameters, key_now)
+        change, memory = optimizer.update(ascent, state.optimizer)
+        state = GradientState(state.parameters + change, memory, key, state.lost + lost)
+        return state, metrics | {"slope": jnp.linalg.norm(ascent)}
+
+    return jax.lax.scan(step, state, length=steps)
+
+
+def current(config: GradientConfig, start: Controller, state: GradientState) -> Controller:
+    """The controller where the ascent is."""
+    return coordinates(start, config.searched)[-1](state.parameters)

@@ -1,0 +1,198 @@
+"""The gradient through the simulator: what it is, what it does with lost runs, what it achieves."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close
+from jax.flatten_util import ravel_pytree
+
+from jaxpend import JaxpendError, Policy, Scenario, designs, gradient
+from jaxpend.config import GradientConfig
+from jaxpend.controllers import energy_shaping
+from jaxpend.controllers.parameters import coordinates
+from jaxpend.plant import rk4_step
+from jaxpend.scenario import Pulses
+from jaxpend.score import nominal, official, score_v2
+
+KEY = jax.random.key(0)
+
+
+def network(robot="pendubot", width=5):
+    """A small random policy."""
+    rng = np.random.default_rng(1)
+    sizes = ((6, width), (width, 1))
+    layers = tuple((jnp.asarray(rng.normal(size=s)), jnp.zeros(s[1])) for s in sizes)
+    return Policy(layers, jnp.asarray(3.0), robot=robot, activation="tanh")
+
+
+def numeric(function, z, direction, h=1e-5):
+    """Central difference."""
+    return (function(z + h * direction) - function(z - h * direction)) / (2 * h)
+
+
+@pytest.mark.x64
+@pytest.mark.parametrize(("robot", "of"), [("acrobot", "performance"), ("pendubot", "robustness")])
+def test_gradient_agrees_with_finite_differences(robot, of):
+    start = network(robot)
+    config = GradientConfig(duration=0.4, scenario_duration=0.4, clip=1e9, power_width=0.1)
+    z, _, rebuild = coordinates(start)
+    pulses = Pulses(jnp.full((2, 1), 0.2), jnp.full((2, 1), 0.05), jnp.array([[0.7], [-0.4]]))
+    wrong = Scenario(
+        designs.competition(robot), jnp.array([2.9, 0.2, 0.3, -0.1]), pulses=pulses,
+        measurement_noise=jnp.array([0.0, 0.0, 0.1, 0.1]), delay=np.full(4, 3),
+        torque_noise=jnp.array([0.1, 0.1]), responsiveness=jnp.asarray(0.4),
+    )  # fmt: skip
+    function = {
+        "performance": lambda z: gradient.performance(config, rebuild(z), robot),
+        "robustness": lambda z: gradient.robustness(config, rebuild(z), wrong, KEY),
+    }[of]
+    function, slope = jax.jit(function), jax.jit(jax.grad(function))(z)
+    for direction in np.random.default_rng(0).normal(size=(3, len(z))):
+        difference = numeric(function, z, direction)
+        assert abs(difference) > 1e-6
+        np.testing.assert_allclose(slope @ direction, difference, rtol=1e-5)
+
+
+def test_a_fading_gradient_leaves_values_alone_and_shrinks_with_time():
+    plant = designs.competition("acrobot")
+
+    @partial(jax.jit, static_argnums=0)
+    def after(integrate, x):
+        step = lambda x, _: (integrate(plant, x, jnp.array([0.0, 0.3]), 0.01), None)  # noqa: E731
+        return jax.lax.scan(step, x, length=5)[0]
+
+    x, fading = jnp.array([0.3, -0.5, 1.0, 2.0]), gradient._fading(0.1)
+    assert_close(after(fading, x), after(rk4_step, x), times=0.1)
+    true = jax.jacobian(after, 1)(rk4_step, x)
+    assert_close(jax.jacobian(after, 1)(fading, x), np.exp(-0.05 / 0.1) * true)
+    assert gradient._fading(np.inf) is rk4_step
+
+
+def test_uprightness_is_highest_at_rest_on_any_turn_and_half_at_the_edge_of_success():
+    top = np.array([np.pi, 0, 0, 0], "f4")
+    assert_close(gradient.uprightness(top + 2 * np.pi * np.array([1, -1, 0, 0], "f4")), 1.0)
+    assert_close(gradient.uprightness(top + np.array([0, 0, 0, 1], "f4")), 0.5)
+    edge = gradient.uprightness(top + np.array([[0.35, 0, 0, 0], [0, -0.35, 0, 0]], "f4"))
+    np.testing.assert_allclose(edge, 0.5, atol=0.01)
+    assert gradient.uprightness(np.zeros(4, "f4")) < 0.05
+
+
+def test_smooth_score_of_a_whole_run_is_nearly_the_official_one(imitation):
+    config = GradientConfig(duration=10.0)
+    smooth = jax.jit(lambda p: gradient.performance(config, p, "pendubot"))(imitation.policy)
+    np.testing.assert_allclose(smooth, official(imitation.policy, "pendubot")["score"], atol=2e-3)
+
+
+def toy_slope(monkeypatch, share=lambda scenario: 1.0):
+    """``slope`` of objectives whose gradients are known: ones, and ``share`` in a scenario."""
+    total = lambda controller: ravel_pytree(controller.layers)[0].sum()  # noqa: E731
+    monkeypatch.setattr(gradient, "performance", lambda config, p, robot: total(p))
+    robustness = lambda config, p, scenario, key: share(scenario) * total(p)  # noqa: E731
+    monkeypatch.setattr(gradient, "robustness", robustness)
+    return jax.jit(lambda *arguments: gradient.slope(*arguments), static_argnums=(0, 2))
+
+
+def test_a_run_that_is_not_finite_is_left_out_and_counted(monkeypatch):
+    slope = toy_slope(monkeypatch, lambda scenario: jnp.where(scenario.delay[0] > 0, jnp.nan, 2.0))
+    start = network()
+    z, _, _ = coordinates(start)
+    config = GradientConfig(scenarios=20, scenario_weight=0.25, clip=1e9)
+    ascent, lost, metrics = slope(config, start, "pendubot", z, KEY)
+    assert 1 <= lost <= 10
+    np.testing.assert_allclose(ascent, 0.75 * 1 + 0.25 * 2, rtol=1e-6)
+    np.testing.assert_allclose(metrics["uprightness"], 2 * z.sum(), rtol=1e-5)
+    # The nominal run too; and if nothing is left, nothing moves.
+    gone = start.replace(layers=jax.tree.map(lambda leaf: leaf * jnp.nan, start.layers))
+    ascent, lost, _ = slope(config, gone, "pendubot", coordinates(gone)[0], KEY)
+    assert lost == 21
+    np.testing.assert_array_equal(ascent, 0)
+
+
+def test_each_run_is_clipped_before_they_are_averaged(monkeypatch):
+    slope = toy_slope(monkeypatch, lambda scenario: jnp.where(scenario.delay[0] > 0, 1e6, 1e-3))
+    start = network()
+    z, _, _ = coordinates(start)
+    plain = GradientConfig(clip=0.5)
+    assert_close(jnp.linalg.norm(slope(plain, start, "pendubot", z, KEY)[0]), 0.5)
+    robust = GradientConfig(clip=0.5, scenarios=20, scenario_weight=1.0)
+    ascent, lost, _ = slope(robust, start, "pendubot", z, KEY)
+    assert lost == 0
+    assert jnp.linalg.norm(ascent) < 0.5 * 10 / 20
+
+
+@pytest.fixture(scope="module")
+def off(imitation):
+    """The imitation with a bias in its torque."""
+    *hidden, (kernel, bias) = imitation.policy.layers
+    return imitation.policy.replace(layers=(*hidden, (kernel, bias + 0.05)))
+
+
+def test_it_improves_the_policy_and_repeats_itself(off):
+    config = GradientConfig(steps=40, learning_rate=1e-4)
+    state, metrics = gradient.improve(config, off, gradient.init(config, off, KEY), 40, "pendubot")
+    smooth = np.asarray(metrics["smooth_score"])
+    assert smooth[-1] > smooth[0] + 0.003
+    found = gradient.current(config, off, state)
+    before, after = (float(score_v2(nominal(p, "pendubot"))) for p in (off, found))
+    assert after > before + 0.003
+    assert state.lost == 0
+    again, _ = gradient.improve(config, off, gradient.init(config, off, KEY), 40, "pendubot")
+    np.testing.assert_array_equal(again.parameters, state.parameters)
+
+
+def test_jitted_as_eager():
+    start, config = network(), GradientConfig(duration=0.1)
+    arguments = config, start, "pendubot", coordinates(start)[0], KEY
+    eager, _, metrics = gradient.slope(*arguments)
+    jitted, _, expected = jax.jit(gradient.slope, static_argnums=(0, 2))(*arguments)
+    assert_close(jitted, eager)
+    assert_close(metrics["smooth_score"], expected["smooth_score"])
+
+
+def test_scenarios_come_from_the_key():
+    start = network()
+    config = GradientConfig(steps=1, duration=0.02, scenario_duration=0.5, scenarios=2)
+    ends = []
+    for seed in (0, 0, 1):
+        begun = gradient.init(config, start, jax.random.key(seed))
+        state, metrics = gradient.improve(config, start, begun, 1, "pendubot")
+        ends.append((float(metrics["uprightness"][0]), np.asarray(state.parameters)))
+    np.testing.assert_array_equal(ends[0][1], ends[1][1])
+    assert ends[0][0] != ends[2][0]
+
+
+def test_gains_of_any_controller_climb_with_a_step_of_their_own():
+    start = energy_shaping(designs.competition("acrobot"), "acrobot")
+    config = GradientConfig(
+        steps=3, duration=0.5, gain_learning_rate=0.01, learning_rate=1.0, final_learning_rate=1.0
+    )
+    begun = gradient.init(config, start, KEY)
+    state, metrics = gradient.improve(config, start, begun, 3, "acrobot")
+    # The first steps of Adam are as long as its rate.
+    moved = np.abs(np.asarray(state.parameters))
+    np.testing.assert_allclose(moved, 0.03, rtol=0.05)
+    assert metrics["smooth_score"][-1] > metrics["smooth_score"][0]
+    found = gradient.current(config, start, state)
+    assert found.kp != start.kp
+    np.testing.assert_array_equal(found.plant.mass, start.plant.mass)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"steps": 0}, "steps is 0; it must be positive"),
+        ({"clip": 0.0}, "clip is 0.0; it must be positive"),
+        ({"memory": float("nan")}, "memory is nan; it must be positive"),
+        ({"scenarios": -1}, "scenarios must not be negative"),
+        ({"scenario_weight": 1.5}, "scenario_weight lies in 0 to 1"),
+    ],
+)
+def test_senseless_values_are_one_sentence(values, words):
+    with pytest.raises(JaxpendError) as error:
+        dataclasses.replace(GradientConfig(), **values)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
