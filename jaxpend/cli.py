@@ -46,6 +46,11 @@ COMMANDS = {
         "SAC on the surrogate reward",
         "--config experiments/pendubot.yaml --seed 1",
     ),
+    "gradient": Command(
+        "train a policy",
+        "the gradient of the smooth score, from a policy or any other controller",
+        "--robot acrobot --policy runs/mine/sac_best.npz --gradient.steps 1000",
+    ),
     "snes": Command(
         "train a policy",
         "SNES on the official score, from a policy or any other controller",
@@ -233,7 +238,7 @@ def _configured(kind: type, args: Sequence[str]) -> tuple[type, Any, list[str]]:
         from .runs import load_config
 
         # One file serves several commands: sections that this one has no field for are passed over.
-        default = load_config(default, path, also=("policy", "sac", "guard", "snes"))
+        default = load_config(default, path, also=("policy", "sac", "gradient", "guard", "snes"))
     return kind, default, rest
 
 

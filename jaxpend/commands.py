@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Literal
 
 from .cli import emit_json
-from .config import SACRun, Search, SNESRun, TrainRun
+from .config import GradientRun, SACRun, Search, SNESRun, TrainRun
 from .files import write_atomically
 from .robots import active_joint
 
 __all__ = [
+    "gradient",
     "leaderboard",
     "optimise",
     "report",
@@ -28,7 +29,7 @@ __all__ = [
 
 
 def train(config: TrainRun, command: str) -> None:
-    """SAC on the surrogate reward, then SNES on the official score, in a run folder."""
+    """SAC on the surrogate reward, then the gradient and SNES on the score, in a run folder."""
     from .train import execute
 
     execute(config, command)
@@ -36,6 +37,13 @@ def train(config: TrainRun, command: str) -> None:
 
 def sac(config: SACRun, command: str) -> None:
     """SAC on the surrogate reward, in a run folder."""
+    from .train import execute
+
+    execute(config, command)
+
+
+def gradient(config: GradientRun, command: str) -> None:
+    """The gradient of the smooth score, from a policy or any other controller, in a run folder."""
     from .train import execute
 
     execute(config, command)

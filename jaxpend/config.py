@@ -15,8 +15,9 @@ __all__ = [
     "CheckpointConfig",
     "DemonstrationConfig",
     "EnvConfig",
-    "GuardConfig",
     "GradientConfig",
+    "GradientRun",
+    "GuardConfig",
     "Reward",
     "Run",
     "SACConfig",
@@ -222,7 +223,7 @@ class CheckpointConfig:
 class GradientConfig:
     """Hyperparameters of the ascent by the gradient through the simulator."""
 
-    steps: int = 1000  # of Adam
+    steps: int = 600  # of Adam; 0: ``train`` leaves the stage out
     learning_rate: float = 1e-4  # of a network's weights
     gain_learning_rate: float = 1e-3  # of the logarithm of all else: a fraction
     final_learning_rate: float = 0.01  # cosine decay to this fraction of learning_rate
@@ -239,13 +240,15 @@ class GradientConfig:
 
     def __post_init__(self):
         for name in (
-            "steps", "learning_rate", "gain_learning_rate", "final_learning_rate", "duration",
+            "learning_rate", "gain_learning_rate", "final_learning_rate", "duration",
             "clip", "memory", "line_width", "power_width", "scenario_duration", "chunk",
         ):  # fmt: skip
             if not getattr(self, name) > 0:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
-        if self.scenarios < 0 or not 0 <= self.scenario_weight <= 1:
-            raise JaxpendError("scenarios must not be negative, scenario_weight lies in 0 to 1")
+        if self.steps < 0 or self.scenarios < 0 or not 0 <= self.scenario_weight <= 1:
+            raise JaxpendError(
+                "steps and scenarios must not be negative, scenario_weight lies in 0 to 1"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -277,7 +280,7 @@ class Run:
     def folder(self) -> Path:
         """Path of the run folder."""
         # A stage alone must not land in the folder of the whole run that it may start from.
-        stage = {SACRun: "-sac", SNESRun: "-snes"}.get(type(self), "")
+        stage = {SACRun: "-sac", GradientRun: "-gradient", SNESRun: "-snes"}.get(type(self), "")
         seeds = f"s{self.seed}-{self.seed + self.seeds - 1}" if self.seeds > 1 else str(self.seed)
         return Path(self.runs) / (self.run or f"{self.robot}{stage}-seed{seeds}")
 
@@ -297,6 +300,20 @@ class SACRun(Run):
 
 
 @dataclasses.dataclass(frozen=True)
+class GradientRun(Run):
+    """The gradient alone, from a policy or any other controller."""
+
+    policy: str = ""  # file to start from; empty: the policy that ships with the package
+    controller: str = ""  # start instead from a known one, around that policy, or module:name
+    gradient: GradientConfig = dataclasses.field(default_factory=GradientConfig)
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not self.gradient.steps:
+            raise JaxpendError("gradient.steps is 0; a run of the gradient alone needs some")
+
+
+@dataclasses.dataclass(frozen=True)
 class SNESRun(Run):
     """SNES alone, from a policy or any other controller."""
 
@@ -307,8 +324,9 @@ class SNESRun(Run):
 
 @dataclasses.dataclass(frozen=True)
 class TrainRun(SACRun):
-    """SAC, then SNES from its best policy, guarded."""
+    """SAC, then from its best policy the gradient, where it has steps, then SNES, guarded."""
 
+    gradient: GradientConfig = dataclasses.field(default_factory=lambda: GradientConfig(steps=0))
     guard: GuardConfig = dataclasses.field(default_factory=GuardConfig)
     snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
 

@@ -160,3 +160,9 @@ def improve(
 def current(config: GradientConfig, start: Controller, state: GradientState) -> Controller:
     """The controller where the ascent is."""
     return coordinates(start, config.searched)[-1](state.parameters)
+
+
+if __name__ == "__main__":
+    from .cli import main
+
+    main("gradient")

@@ -13,10 +13,21 @@ from typing import Any
 
 from .errors import JaxpendError
 
-__all__ = ["STAGES", "listing", "runs_table", "seed_folders"]
+__all__ = ["RESULTS", "STAGES", "listing", "runs_table", "seed_folders"]
 
 # Stage -> column of the metrics that says how far it is, field of the configuration it goes to.
-STAGES = {"sac": ("env_steps", "steps"), "snes": ("generation", "generations")}
+STAGES = {
+    "sac": ("env_steps", "steps"),
+    "gradient": ("step", "steps"),
+    "snes": ("generation", "generations"),
+}
+# What ``result.json`` may have scores of, and how people call it.
+RESULTS = {
+    "start": "start",
+    "sac": "after SAC",
+    "gradient": "after the gradient",
+    "snes": "after SNES",
+}
 
 
 def _json(path: Path) -> Any:
@@ -69,7 +80,11 @@ def _run(folder: Path, name: str) -> dict[str, Any]:
     if not isinstance(config, dict) or "robot" not in config:
         return about | {"at": "config.json"}
     about |= {"robot": config["robot"], "seed": config.get("seed")}
-    about["stages"] = [stage for stage in STAGES if isinstance(config.get(stage), dict)]
+    about["stages"] = [
+        stage
+        for stage, (_, total) in STAGES.items()
+        if isinstance(config.get(stage), dict) and config[stage].get(total, 1)
+    ]
     at, about["seconds"] = _progress(folder, config)
     if isinstance(result, dict) and isinstance(result.get("score"), int | float):
         return about | {"state": "finished", "score": result["score"]}

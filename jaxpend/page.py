@@ -14,12 +14,13 @@ import numpy as np
 from . import __version__, plots
 from .animation import gif, keyframes
 from .boards import HEADINGS, PUBLISHED
-from .config import SACRun, SNESRun, TrainRun
+from .config import GradientRun, SACRun, SNESRun, TrainRun
 from .controllers.policy import read_header
 from .controllers.saved import load_controller
 from .curves import draw_angles, draw_curves, draw_height, draw_phase, draw_torque, draw_velocities
 from .designs import competition
 from .files import write_atomically
+from .listing import RESULTS, STAGES
 from .report import CURVES, Found, remarks
 from .robots import active_joint
 from .robustness import CRITERIA, benchmark
@@ -164,8 +165,11 @@ def _flat(config: Mapping, prefix: str = "") -> dict[str, Any]:
 def _changed(config: Mapping) -> list[tuple[str, Any, Any]]:
     """Fields that are not as the package has them by default: name, value, default."""
 
-    kinds = {(True, True): TrainRun, (True, False): SACRun, (False, True): SNESRun}
-    kind = kinds.get(("sac" in config, "snes" in config))
+    kinds = {
+        ("sac", "gradient", "snes"): TrainRun, ("sac", "snes"): TrainRun, ("sac",): SACRun,
+        ("gradient",): GradientRun, ("snes",): SNESRun,
+    }  # fmt: skip
+    kind = kinds.get(tuple(stage for stage in STAGES if stage in config))
     default = _flat(to_mapping(kind(robot=config["robot"]))) if kind else {}
     return [
         (name, value, default.get(name, ""))
@@ -232,8 +236,7 @@ def _seed_table(runs: Sequence[Found], judged: Sequence[Judged | None]) -> list[
 
 def _stages(run: Found) -> dict[str, dict]:
     """What ``result.json`` says of each stage."""
-    names = {"start": "start", "sac": "after SAC", "snes": "after SNES"}
-    return {title: run.result[key] for key, title in names.items() if key in (run.result or {})}
+    return {title: run.result[key] for key, title in RESULTS.items() if key in (run.result or {})}
 
 
 def _summary(values: Sequence[float | None]) -> dict[str, float] | None:

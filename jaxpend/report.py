@@ -12,7 +12,7 @@ from .listing import STAGES, seed_folders
 __all__ = ["CURVES", "Found", "find", "remarks"]
 
 # Policies of a run, the final one first.
-POLICIES = ("policy.npz", "snes_best.npz", "sac_best.npz")
+POLICIES = ("policy.npz", "snes_best.npz", "gradient_best.npz", "sac_best.npz")
 # Stage -> its title, the column on x, what that is, and the charts: title, label -> column,
 # label on y, logarithmic.
 CURVES = {
@@ -26,6 +26,11 @@ CURVES = {
         ("Entropy of the policy", {"entropy": "entropy"}, "nats", False),
         ("Loss of the critics", {"loss": "critic_loss"}, "", True),
         ("Loss of the actor", {"loss": "actor_loss"}, "", False),
+    )),
+    "gradient": ("Gradient", "step", "steps", (
+        ("Official score", {"best so far": "best", "now": "score"}, "v2 score", False),
+        ("Smooth score", {"smooth score": "smooth_score"}, "of the nominal run", False),
+        ("Norm of the gradient", {"norm": "slope"}, "", True),
     )),
     "snes": ("SNES", "generation", "generations", (
         ("Fitness", {"mean": "mean_fitness", "best": "max_fitness"}, "noisy v2 score", False),
@@ -51,6 +56,7 @@ class Found:
     def stages(self) -> dict[str, tuple[int, int]]:
         """Stage -> how far it is, and how far it is to go. The last chunk may go beyond."""
         goals = {s: self.config[s][total] for s, (_, total) in STAGES.items() if s in self.config}
+        goals = {stage: goal for stage, goal in goals.items() if goal}
         demonstrations = self.config.get("sac", {}).get("demonstrations", {})
         if demonstrations.get("episodes"):
             goals = {"imitation": demonstrations["updates"], **goals}

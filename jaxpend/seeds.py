@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from rich.table import Table
 
+from .listing import RESULTS
 from .spread import interquartile_mean, interval
 from .terminal import console
 
@@ -28,7 +29,7 @@ def summary(results: Sequence[Mapping]) -> dict:
 
     ``interval`` is the 95 % bootstrap interval of the interquartile mean.
     """
-    stages = [name for name in ("start", "sac", "snes") if name in results[0]]
+    stages = [name for name in RESULTS if name in results[0]]
     return {
         "robot": results[0]["robot"],
         "seeds": [result["seed"] for result in results],
@@ -42,10 +43,9 @@ def seeds_table(group: Mapping) -> None:
     headings = ("", "median", "interquartile mean", "95 %", "lowest to highest")
     for heading in headings:
         table.add_column(heading, justify="right" if heading else "left")
-    names = {"start": "start", "sac": "after SAC", "snes": "after SNES"}
     for name, found in group["stages"].items():
         ends = (found["interval"], (found["lowest"], found["highest"]))
         points = (f"{found[key]:.4f}" for key in ("median", "interquartile_mean"))
         ranges = ("" if e is None else f"{e[0]:.4f} to {e[1]:.4f}" for e in ends)
-        table.add_row(names[name], *points, *ranges)
+        table.add_row(RESULTS[name], *points, *ranges)
     console.print(table)

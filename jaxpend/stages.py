@@ -11,14 +11,14 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from . import sac, snes
-from .config import GuardConfig, SACConfig, SNESConfig
+from . import gradient, sac, snes
+from .config import GradientConfig, GuardConfig, SACConfig, SNESConfig
 from .controllers.base import Controller
 from .controllers.guard import guard
 from .controllers.parameters import kinds
 from .score import nominal, score_v2
 
-__all__ = ["SAC", "SNES", "Imitation", "Stage"]
+__all__ = ["SAC", "SNES", "Gradient", "Imitation", "Stage"]
 
 
 class Stage:
@@ -157,6 +157,58 @@ class SAC(Stage):
 
     def watched(self, state):
         return state.replace(demonstrations=None)
+
+
+class Gradient(Stage):
+    """The gradient of the smooth score; judged is where it is."""
+
+    name, title, unit, column = "gradient", "gradient", "steps", "step"
+
+    def __init__(self, config: GradientConfig, policy: Any, robot: str):
+        """``policy`` is a controller of the structure that the ascent starts from.
+
+        Raises ``JaxpendError`` if it has nothing to search.
+        """
+        kinds(policy, config.searched)
+        self.config, self.total = config, config.steps
+        self.policy, self.robot = policy, robot
+
+    def start(self, seed, before):
+        key = jax.random.fold_in(jax.random.key(seed), 2)
+        search = gradient.init(self.config, before, key)
+        return {"start": before, "search": search, "done": jnp.asarray(0)}
+
+    def like(self):
+        return jax.eval_shape(lambda policy: self.start(0, policy), self.policy)
+
+    def policy_like(self):
+        return self.policy
+
+    def done(self, state):
+        return int(state["done"])
+
+    def advance(self, states):
+        count, after = min(self.config.chunk, self.total - self.done(states[0])), []
+        for state in states:
+            arguments = self.config, state["start"], state["search"], count, self.robot
+            search, metrics = gradient.improve(*arguments)
+            after.append((state | {"search": search, "done": state["done"] + count}, metrics))
+        return after
+
+    def judge(self, state, metrics):
+        policy = gradient.current(self.config, state["start"], state["search"])
+        score = float(score_v2(nominal(policy, self.robot)))
+        row = {"score": score, "lost": int(state["search"].lost)}
+        return row | {name: values[-1] for name, values in metrics.items()}, [(policy, score)]
+
+    def note(self, row):
+        return f"smooth score {float(row['smooth_score']):.4f}  score {row['score']:.4f}"
+
+    def watched(self, state):
+        return state["search"].parameters
+
+    def rekey(self, state, number):
+        return state | {"search": super().rekey(state["search"], number)}
 
 
 class SNES(Stage):

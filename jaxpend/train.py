@@ -1,4 +1,4 @@
-"""The whole job: SAC on the surrogate reward, then SNES on the official score, in a run folder."""
+"""The whole job: SAC on the surrogate reward, then the gradient and SNES on the official score."""
 
 import contextlib
 import dataclasses
@@ -12,16 +12,17 @@ import numpy as np
 
 from . import designs
 from .checkpoint import Checkpoints
-from .config import Run, SACRun, SNESRun, TrainRun
+from .config import GradientRun, Run, SACRun, SNESRun, TrainRun
 from .controllers.base import Controller
 from .controllers.known import find_controller
 from .errors import JaxpendError
 from .files import to_json, write_atomically
 from .interrupt import Stopped, deferred, stop_if_asked
+from .listing import RESULTS
 from .runs import RunFolder
 from .score import official
 from .seeds import seeds_table, summary
-from .stages import SAC, SNES, Imitation, Stage
+from .stages import SAC, SNES, Gradient, Imitation, Stage
 from .terminal import LiveProgress, console, score_table
 
 __all__ = ["execute", "train"]
@@ -204,13 +205,15 @@ def train_stage(stage: Stage, runs: Sequence[SeedRun]) -> None:
 
 
 def stages_of(config: Run, start: Controller | None) -> dict[str, Stage]:
-    """The stages of a configuration, by name; ``start`` is what SNES starts from if it is alone."""
+    """The stages of a configuration, by name; ``start`` is what a stage alone starts from."""
     stages: list[Stage] = []
     if isinstance(config, SACRun):
         if config.sac.demonstrations.episodes:
             stages.append(Imitation(config.sac))
         stages.append(SAC(config.sac))
         start = stages[-1].policy_like()
+    if getattr(config, "gradient", None) and config.gradient.steps:
+        stages.append(Gradient(config.gradient, start, config.robot))
     if isinstance(config, SNESRun | TrainRun):
         guarding = getattr(config, "guard", None)
         stages.append(SNES(config.snes, start, config.robot, guarding))
@@ -231,7 +234,9 @@ def train(config: Run, command: str = "jaxpend.train.train") -> dict:
         Stopped: a signal asked for it, and everything is on disk.
     """
     start = None
-    if isinstance(config, SNESRun):  # before the folder is made: a wrong file leaves nothing behind
+    if isinstance(
+        config, GradientRun | SNESRun
+    ):  # before the folder is made: a wrong file leaves nothing behind
         plant = designs.competition(config.robot)
         start = find_controller(config.policy, config.controller, plant, config.robot)
     stages = stages_of(config, start)
@@ -285,8 +290,7 @@ def execute(config: Run, command: str) -> None:
     if config.seeds > 1:
         seeds_table(result)
     else:
-        stages = {"start": "start", "sac": "after SAC", "snes": "after SNES"}
-        score_table({stages[k]: result[k] for k in stages if k in result}, config.robot)
+        score_table({RESULTS[k]: result[k] for k in RESULTS if k in result}, config.robot)
     console.print(f"policy.npz, metrics and result are in [bold]{config.folder}[/bold]")
 
 

@@ -184,10 +184,10 @@ def test_gains_of_any_controller_climb_with_a_step_of_their_own():
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"steps": 0}, "steps is 0; it must be positive"),
+        ({"steps": -1}, "steps and scenarios must not be negative"),
         ({"clip": 0.0}, "clip is 0.0; it must be positive"),
         ({"memory": float("nan")}, "memory is nan; it must be positive"),
-        ({"scenarios": -1}, "scenarios must not be negative"),
+        ({"scenarios": -1}, "steps and scenarios must not be negative"),
         ({"scenario_weight": 1.5}, "scenario_weight lies in 0 to 1"),
     ],
 )

@@ -14,13 +14,13 @@ import pytest
 from training_runs import OPTIONS, arrays_of, rows_of
 
 from jaxpend import Policy, cli, designs, load_policy, save_policy
-from jaxpend.config import SACRun, SNESConfig, SNESRun, TrainRun
+from jaxpend.config import GradientConfig, GradientRun, SACRun, SNESConfig, SNESRun, TrainRun
 from jaxpend.controllers import Guarded, load_controller
 from jaxpend.controllers.known import build
 from jaxpend.controllers.policy import network_in, read_header
 from jaxpend.interrupt import Stopped
 from jaxpend.score import official
-from jaxpend.train import train
+from jaxpend.train import stages_of, train
 
 CRITERIA = {
     "swingup_time", "energy", "tau_cost", "tau_smoothness", "velocity_cost", "max_tau",
@@ -39,7 +39,7 @@ def policy_file(folder, robot="pendubot"):
 
 def run_command(monkeypatch, kind, *arguments):
     """A training command in this process. Raises SystemExit unless it exits with 0."""
-    name = {SACRun: "sac", SNESRun: "snes", TrainRun: "train"}[kind]
+    name = {SACRun: "sac", GradientRun: "gradient", SNESRun: "snes", TrainRun: "train"}[kind]
     monkeypatch.setattr("sys.argv", ["jaxpend", name, *map(str, arguments)])
     try:
         cli.main()
@@ -133,6 +133,29 @@ def test_snes_starts_from_a_policy_file(whole_run, monkeypatch, tmp_path):
     assert {"policy.npz", "snes_best.npz", "snes_last.npz"} <= names
 
 
+def test_the_gradient_starts_from_a_policy_file(imitation, monkeypatch, tmp_path):
+    start, folder = tmp_path / "start.npz", tmp_path / "fine"
+    save_policy(start, imitation.policy)
+    options = ["--gradient.steps", "5", "--gradient.chunk", "3", "--gradient.learning-rate", "3e-5"]
+    options += ["--policy", start, "--runs", tmp_path, "--run", "fine"]
+    run_command(monkeypatch, GradientRun, *options)
+    result = json.loads((folder / "result.json").read_text())
+    assert result["score"] == result["gradient"]["score"] > result["start"]["score"]
+    assert [row["step"] for row in rows_of(folder, "gradient")] == [0, 3, 5]
+    assert {"policy.npz", "gradient_best.npz"} <= {path.name for path in folder.iterdir()}
+
+
+def test_the_gradient_has_a_place_between_sac_and_snes_where_it_has_steps():
+    assert list(stages_of(TrainRun(), None)) == ["sac", "snes"]
+    stages = stages_of(TrainRun(gradient=GradientConfig(steps=3)), None)
+    assert list(stages) == ["sac", "gradient", "snes"]
+    # What a checkpoint is read into is what a run has.
+    stage, policy = stages["gradient"], load_policy("pendubot")
+    stage = type(stage)(stage.config, policy, "pendubot")
+    shapes = lambda tree: jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)  # noqa: E731
+    assert shapes(stage.like()) == shapes(stage.start(0, policy))
+
+
 def test_snes_fine_tunes_any_controller_and_goes_on_where_it_was(monkeypatch, tmp_path):
     snes = SNESConfig(generations=4, population=4, chunk=2, searched="gain", gain_sigma=0.3)
     run = SNESRun(controller="tvlqr", runs=str(tmp_path), run="whole", snes=snes)
@@ -177,6 +200,7 @@ def one_sentence(err):
     ("kind", "options", "words"),
     [
         (SNESRun, "--policy {}/nothing.npz", "there is no policy file"),
+        (GradientRun, "--gradient.steps 0", "gradient.steps is 0"),
         (SNESRun, "--policy {}/acrobot.npz", "is a policy for the acrobot, not for the pendubot"),
         (SNESRun, "--policy {}/empty.npz", "is not a policy file, or it is empty or cut off"),
         (SNESRun, "--policy {}/cut.npz", "is not a policy file, or it is empty or cut off"),
