@@ -38,7 +38,7 @@ def numeric(function, z, direction, h=1e-5):
 @pytest.mark.parametrize(("robot", "of"), [("acrobot", "performance"), ("pendubot", "robustness")])
 def test_gradient_agrees_with_finite_differences(robot, of):
     start = network(robot)
-    config = GradientConfig(duration=0.4, scenario_duration=0.4, clip=1e9, power_width=0.1)
+    config = GradientConfig(duration=0.4, scenario_duration=0.4, memory=np.inf, power_width=0.1)
     z, _, rebuild = coordinates(start)
     pulses = Pulses(jnp.full((2, 1), 0.2), jnp.full((2, 1), 0.05), jnp.array([[0.7], [-0.4]]))
     wrong = Scenario(
