@@ -2,7 +2,7 @@
 
     python experiments/front.py
 
-reads leaderboard.json, seeds.json and ablation.json beside this file and draws front.png: a
+reads leaderboard.json, seeds.json, ablation.json and plain.json beside this file and draws front.png: a
 controller on the line is beaten in both by no other that was measured.
 """
 
@@ -35,7 +35,7 @@ def points(robot: str) -> list[tuple[str, str, float, float]]:
     for row in rows:
         if row["source"] == "measured" and row["robustness"] is not None and row["score"] > 0:
             found.append(("baseline", row["title"], row["score"], row["robustness"]))
-    for name in ("seeds", "ablation"):
+    for name in ("seeds", "ablation", "plain"):
         for row in json.loads((HERE / f"{name}.json").read_text()):
             if row["robot"] == robot:
                 kind = "shipped" if row["recipe"] == "shipped" else "ablation"
