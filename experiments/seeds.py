@@ -19,6 +19,7 @@ import numpy as np
 
 HERE = Path(__file__).parent
 ROBOTS = ("acrobot", "pendubot")
+STAGES = ("sac", "gradient", "snes")
 # What a recipe changes of the robot's own; "plain" has a file of its own.
 RECIPES = {
     "shipped": [],
@@ -26,6 +27,7 @@ RECIPES = {
     "no observer": ["--guard.bandwidth", "0"],
     "no rescue": ["--guard.rescue", "no"],
     "no pulses": ["--sac.demonstrations.pulses", "0"],
+    "no gradient": ["--gradient.steps", "0"],
     "no SAC": ["--sac.steps", "32"],  # fewer than the actor's delay: imitation alone
     "robust SNES": ["--snes.scenarios", "16", "--snes.generations", "60"],
     "plain": [],
@@ -69,8 +71,7 @@ def train(recipe: str, robot: str, seed: int, runs: Path) -> dict:
         "robot": robot,
         "seed": seed,
         "imitation": None if recipe == "plain" else first["score"],
-        "sac": {k: result["sac"][k] for k in keys},
-        "snes": {k: result["snes"][k] for k in keys},
+        **{n: {k: result[n][k] for k in keys} for n in STAGES if n in result},
         "criteria": result["snes"]["criteria"],
         "robustness": robustness(robot, folder / "policy.npz"),
     }
@@ -82,18 +83,18 @@ def table(rows: list[dict], jobs: int) -> str:
         f"Machine: {platform.machine()}, {os.cpu_count()} cores; single-threaded runs, {jobs} at "
         "once; robustness: median (range) over 5 benchmark keys.",
         "",
-        "| recipe | robot | seed | imitation | then SAC | then SNES | robustness | SAC | SNES |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| recipe | robot | seed | imitation | then SAC | then gradient | then SNES | robustness "
+        "| SAC | gradient | SNES |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:
-        start = "" if r["imitation"] is None else f"{r['imitation']:.4f}"
-        lines.append(
-            f"| {r['recipe']} | {r['robot']} | {r['seed']} | {start} | {r['sac']['score']:.4f} | "
-            f"{r['snes']['score']:.4f} | {r['robustness']['median']:.3f} "
-            f"({r['robustness']['lowest']:.3f} to {r['robustness']['highest']:.3f}) | "
-            f"{r['sac']['seconds']:.0f} s | "
-            f"{r['snes']['seconds']:.0f} s |"
-        )
+        overall = r["robustness"]
+        cells = [r["recipe"], r["robot"], r["seed"]]
+        cells += ["" if r["imitation"] is None else f"{r['imitation']:.4f}"]
+        cells += [f"{r[n]['score']:.4f}" if n in r else "" for n in STAGES]
+        cells += ["{median:.3f} ({lowest:.3f} to {highest:.3f})".format(**overall)]
+        cells += [f"{r[n]['seconds']:.0f} s" if n in r else "" for n in STAGES]
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
     lines += [
         "",
         "| recipe | robot | seeds | median score | lowest | highest |",
