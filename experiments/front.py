@@ -3,8 +3,7 @@
     python experiments/front.py
 
 reads leaderboard.json, seeds.json, ablation.json and plain.json beside this file and draws
-front.png: a
-controller on the line is beaten in both by no other that was measured.
+front.png: a controller on the line is beaten in both by no other that was measured.
 """
 
 import json
