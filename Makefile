@@ -52,7 +52,7 @@ report: $(STAMP)  ## one page about the run RUN, with pictures
 	$(BIN)/jaxpend report runs/$(RUN) $(ARGS)
 
 test: $(STAMP)  ## the test suite
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)
 
 lint: $(STAMP)  ## ruff: rules and format
 	$(BIN)/ruff check .

@@ -15,6 +15,7 @@ from PIL import Image
 
 from jaxpend import cli, commands, load_policy, page, report, save_policy
 from jaxpend.config import TrainRun
+from jaxpend.controllers.policy import network_in
 from jaxpend.designs import competition
 from jaxpend.robustness import benchmark, strips
 from jaxpend.runs import to_mapping
@@ -254,7 +255,7 @@ def test_what_is_not_a_run_is_one_sentence(tmp_path, monkeypatch, capsys, prepar
 
 
 def test_a_policy_that_fails_is_shown_failing(tmp_path):
-    shipped = load_policy("pendubot")
+    shipped = network_in(load_policy("pendubot"))
     *hidden, (kernel, bias) = shipped.layers
     pushing = shipped.replace(layers=(*hidden, (0 * kernel, bias + 20)))
     save_policy(tmp_path / "push.npz", pushing)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxpend import JaxpendError, Policy, commands, designs, leaderboard, load_policy
+from jaxpend import JaxpendError, Policy, commands, designs, leaderboard, load_policy, save_policy
 from jaxpend._struct import pytree, static
 from jaxpend.controllers import Feedback, Nominal, load_controller, lqr, save_controller
 from jaxpend.controllers.base import Memoryless
@@ -60,8 +60,13 @@ def test_policies_are_policy_files(tmp_path):
     same(load_policy(path), policy)
     same(load_controller("acrobot"), policy)
     hybrid = with_lqr(network_in(policy), PLANT, "acrobot")
-    save_controller(path, hybrid, "acrobot")
-    same(load_policy(path), hybrid)
+    for save in (
+        lambda: save_controller(path, hybrid, "acrobot"),
+        lambda: save_policy(path, hybrid),
+    ):
+        path.unlink()
+        save()
+        same(load_policy(path, robot="acrobot"), hybrid)
     same(network_in(load_policy(path)), network_in(policy))
     with pytest.raises(JaxpendError, match="holds 0 neural networks; one is needed"):
         network_in(lqr(PLANT, "acrobot"), path)

@@ -96,11 +96,23 @@ def _header(policy: Policy, provenance: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def save_policy(path: str | Path, policy: Policy, provenance: dict[str, Any] | None = None) -> None:
+def save_policy(
+    path: str | Path, policy: Controller, provenance: dict[str, Any] | None = None
+) -> None:
     """Write a policy file (.npz without pickle: float32 arrays and a JSON header), atomically.
 
-    ``provenance`` is any JSON object: command, seed, scores, ...
+    Args:
+        path: of the file.
+        policy: a ``Policy``, or a controller with one in it, such as a ``Guarded``.
+        provenance: any JSON object: command, seed, scores, ...
+
+    Raises:
+        JaxpendError: a controller with no policy in it; use ``save_controller``.
     """
+    if not isinstance(policy, Policy):
+        from .saved import save_controller
+
+        return save_controller(path, policy, network_in(policy).robot, provenance)
     arrays = {}
     for i, (kernel, bias) in enumerate(policy.layers):
         arrays |= {f"kernel{i}": np.asarray(kernel, "f4"), f"bias{i}": np.asarray(bias, "f4")}
