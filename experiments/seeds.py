@@ -27,11 +27,13 @@ STAGES = ("sac", "gradient", "snes")
 RECIPES = {
     "shipped": [],
     "no pulses": ["--sac.demonstrations.pulses", "0"],
-    "no gradient": ["--gradient.steps", "0"],
+    "with gradient": [
+        "--gradient.steps", "600", "--snes.sigma", "0.0003", "--snes.generations", "100",
+    ],
     "no SAC": ["--sac.steps", "32"],  # fewer than the actor's delay: imitation alone
     "robust SNES": ["--snes.scenarios", "16", "--snes.generations", "60"],
     "plain": [],
-}
+}  # fmt: skip
 # What is taken from the policy that the shipped recipe ended with; nothing is trained again.
 TAKEN = {
     "no guard": {"observer": None, "rescue": None},
