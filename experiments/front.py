@@ -23,7 +23,7 @@ HERE = Path(__file__).parent
 STYLE = {
     "published": ("#000000", "D", "published boards"),
     "baseline": ("#0072B2", "o", "classical controllers, here"),
-    "ablation": ("#E69F00", "s", "recipe with a part left out"),
+    "ablation": ("#E69F00", "s", "recipe with a part left out or added"),
     "shipped": ("#D55E00", "*", "recipe, every seed"),
 }
 
@@ -33,7 +33,8 @@ def points(robot: str) -> list[tuple[str, str, float, float]]:
     found = [("published", name, *pair) for name, pair in PUBLISHED[robot].items()]
     rows = json.loads((HERE / "leaderboard.json").read_text())[robot]["rows"]
     for row in rows:
-        if row["source"] == "measured" and row["robustness"] is not None and row["score"] > 0:
+        ours = row["source"] == "measured" and not row["name"].startswith("policy")
+        if ours and row["robustness"] is not None and row["score"] > 0:
             found.append(("baseline", row["title"], row["score"], row["robustness"]))
     for name in ("seeds", "ablation", "plain"):
         for row in json.loads((HERE / f"{name}.json").read_text()):
@@ -51,33 +52,48 @@ def front(scores: np.ndarray) -> np.ndarray:
     return best[np.argsort(scores[best, 0])]
 
 
-def main(out: Path = HERE / "front.png") -> None:
-    """Draw the front of both robots."""
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4.6), sharey=True, layout="constrained")
-    for axis, robot in zip(axes, designs.ROBOTS, strict=True):
-        found = points(robot)
-        for kind, (colour, marker, title) in STYLE.items():
-            mine = [p for p in found if p[0] == kind]
-            size = 130 if marker == "*" else 36
-            axis.scatter(
-                [p[2] for p in mine], [p[3] for p in mine], s=size, c=colour, marker=marker,
-                label=title, zorder=3, edgecolors="white", linewidths=0.6,
+def draw(axis, found: list[tuple], labelled: str) -> None:
+    """Points of every kind, names at those of one kind, and the front of what was measured."""
+    for kind, (colour, marker, title) in STYLE.items():
+        mine = [p for p in found if p[0] == kind]
+        axis.scatter(
+            [p[2] for p in mine], [p[3] for p in mine], s=130 if marker == "*" else 36, c=colour,
+            marker=marker, label=title, zorder=3, edgecolors="white", linewidths=0.6,
+        )  # fmt: skip
+        named = sorted(mine, key=lambda p: -p[3]) if kind == labelled else []
+        for i, (_, label, x, y) in enumerate(named):
+            # Left of a published point, right of the crowd; below, where a label stands above.
+            left = kind == "published"
+            crowded = any(abs(x - p[2]) < 0.1 and p[3] - y < 0.04 for p in named[:i])
+            axis.annotate(
+                label, (x, y), (-6 if left else 8, -9 if left and crowded else 2),
+                textcoords="offset points", fontsize=8, ha="right" if left else "left",
+                color=colour, annotation_clip=True,
             )  # fmt: skip
-            for _, label, x, y in mine:
-                if kind == "published" or (kind == "baseline" and y > 0.7):
-                    axis.annotate(
-                        label, (x, y), (-5, 4), textcoords="offset points", fontsize=7,
-                        ha="right", color=colour,
-                    )  # fmt: skip
-        scores = np.array([p[2:] for p in found if p[0] != "published"])
-        best = scores[front(scores)]
-        axis.plot(*best.T, color="0.6", lw=1.2, zorder=2)
-        axis.set(title=robot, xlabel="performance score (v2)", xlim=(0.18, 0.74), ylim=(0, 1.03))
-        axis.grid(color="0.92")
-        axis.set_axisbelow(True)
-    axes[0].set_ylabel("robustness score (v2)")
-    axes[0].legend(loc="lower left", fontsize=8, frameon=False)
-    figure.savefig(out, dpi=150)
+    scores = np.array([p[2:] for p in found if p[0] != "published"])
+    axis.plot(*scores[front(scores)].T, color="0.6", lw=1.2, zorder=2)
+    axis.grid(color="0.92")
+    axis.set_axisbelow(True)
+
+
+def main(out: Path = HERE / "front.png") -> None:
+    """Draw the front of both robots, whole and its upper right corner."""
+    figure, axes = plt.subplots(2, 2, figsize=(10, 9), layout="constrained")
+    corners = {"acrobot": (0.706, 0.719), "pendubot": (0.6945, 0.7035)}
+    for column, robot in enumerate(designs.ROBOTS):
+        whole, corner = axes[:, column]
+        found = points(robot)
+        draw(whole, found, "published")
+        draw(corner, found, "baseline")
+        whole.set(title=robot, xlim=(0.18, 0.74), ylim=(-0.02, 1.03))
+        corner.set(xlim=corners[robot], ylim=(0.55, 1.0), title="upper right corner")
+        for axis in (whole, corner):
+            axis.set_xlabel("performance score (v2)")
+    for row in axes:
+        row[0].set_ylabel("robustness score (v2)")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
+    figure.savefig(out, dpi=110)
 
 
 if __name__ == "__main__":

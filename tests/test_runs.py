@@ -185,8 +185,9 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path, capsys):
         folder.chmod(0o555)
     user = os.geteuid()
     if user == 0:  # may write anywhere
-        tmp_path.parent.chmod(0o755)
-        tmp_path.parents[1].chmod(0o755)
+        for parent in tmp_path.parents:
+            if parent.name.startswith(("pytest-", "popen-")):  # of pytest and its workers
+                parent.chmod(0o755)
         os.seteuid(65534)
     try:
         for name in ("run", "new"):

@@ -205,7 +205,7 @@ def one_sentence(err):
         (SNESRun, "--policy {}/empty.npz", "is not a policy file, or it is empty or cut off"),
         (SNESRun, "--policy {}/cut.npz", "is not a policy file, or it is empty or cut off"),
         (SNESRun, "--snes.population 1", "population is 1"),
-        (SNESRun, "--snes.searched gain", "has no parameter 'gain'; known: layers.0.0"),
+        (SNESRun, "--snes.searched gain", "has no parameter 'gain'; known: main.layers.0.0"),
         (TrainRun, "--snes.searched gain", "has no parameter 'gain'; known: layers.0.0"),
         (SNESRun, "--controller foo", "unknown controller 'foo'; known: policy, policy_network"),
         (SNESRun, "--controller open_loop", "OpenLoop declares no searched parameters"),
