@@ -41,8 +41,11 @@ def test_goals_are_the_upright_angles_where_the_arm_ended(axes, turns, goal):
 
 def test_an_arm_that_spins_without_end_can_be_drawn():
     t, x = swing(1e6)
-    plots.svg(plots.panel(curves.draw_angles, t, x, end=1.0), "a", "angles")
-    plots.svg(plots.panel(curves.draw_phase, x, joint=1), "b", "phase")
+    angles = plots.svg(plots.panel(curves.draw_angles, t, x, end=1.0), "a", "angles")
+    phase = plots.svg(plots.panel(curves.draw_phase, x, joint=1), "b", "phase")
+    for drawn in (angles, phase):
+        assert drawn.count("<path") > 5
+        assert len(drawn) < 1e6
 
 
 def test_height_and_torque_show_the_line_and_the_limits(axes):
