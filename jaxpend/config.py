@@ -61,6 +61,7 @@ class EnvConfig:
     observation: Observation = dataclasses.field(default_factory=Observation)
     reward: Reward = dataclasses.field(default_factory=Reward)
     max_speed: float = math.inf  # rad/s; SAC truncates an episode beyond it
+    randomised: float = 0.0  # share of episodes in a random scenario, see ``randomisation``
 
     def __post_init__(self):
         active_joint(self.robot)
@@ -70,6 +71,8 @@ class EnvConfig:
         for name in ("torque_limit", "dt", "duration", "max_speed"):
             if not getattr(self, name) > 0:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
+        if not 0 <= self.randomised <= 1:
+            raise JaxpendError(f"randomised is {self.randomised}; it is a share, from 0 to 1")
 
     @property
     def episode_steps(self) -> int:

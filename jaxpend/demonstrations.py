@@ -6,7 +6,6 @@ policy that imitates it learns to return from where noise leads (Laskey et al., 
 injection for robust imitation learning", 2017).
 """
 
-from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -38,9 +37,11 @@ def collect(
 ) -> tuple[jax.Array, jax.Array]:
     """Run a controller, called at the environment's control period, under noise.
 
-    Returns replay rows (n, sac.ROW), every one an exact transition (velocity jumps fall between
-    rows), and the wanted actions (n,). Rows in which the controller wants all the torque there is
-    are left out: it has lost the swing-up there and has nothing to teach. ``key`` is consumed.
+    It acts on the true state, also where a policy sees a measured one (Chen et al., "Learning by
+    cheating", 2019). Returns the rows of ``sac.Replay``, every one an exact transition (velocity
+    jumps fall between rows), and the wanted actions (n,). Rows in which the controller wants all
+    the torque there is are left out: it has lost the swing-up there and has nothing to teach.
+    ``key`` is consumed.
 
     Raises:
         JaxpendError: nothing is left.
@@ -49,11 +50,11 @@ def collect(
     steps = round(config.duration / env.config.dt)
 
     def episode(key):
-        key_level, key_start, key_controller, key_action, key_kick, key_pulse = jax.random.split(
-            key, 6
+        key_level, key_start, key_controller, key_action, key_kick, key_pulse, key_reset = (
+            jax.random.split(key, 7)
         )
         level = jax.random.uniform(key_level) ** 2
-        x = level * config.start_spread * jax.random.normal(key_start, (4,))
+        start = level * config.start_spread * jax.random.normal(key_start, (4,))
         noise = level * config.action_noise * jax.random.normal(key_action, (steps,))
         pulses = random_pulses(key_pulse)
         bursts = jax.vmap(pulses.torque)(env.config.dt * jnp.arange(steps))[:, joint]
@@ -61,17 +62,18 @@ def collect(
         kicks = level * config.kicks * jax.random.normal(key_kick, (steps, 2))
 
         def step(carry, now):
-            x, previous, memory = carry
+            before, memory = carry
             k, disturbance, kick = now
-            memory, torque = controller(memory, k * env.config.dt, x)
+            memory, torque = controller(memory, k * env.config.dt, before.pipeline_state["x"])
             wanted = jnp.clip(torque[joint] / limit, -1.0, 1.0)
             action = jnp.clip(wanted + disturbance, -1.0, 1.0)
-            x_next, reward = env.advance(x, previous, action)
-            row = jnp.concatenate([x, jnp.stack([previous, action, reward_scale * reward]), x_next])
-            return (x_next.at[2:].add(kick), action, memory), (row, wanted)
+            after = env.step(before, action[None])
+            paid = jnp.stack([action, reward_scale * after.reward])
+            row = jnp.concatenate([before.obs, paid, after.obs])
+            return (env.kicked(after, jnp.pad(kick, (2, 0))), memory), (row, wanted)
 
-        start = (x, jnp.zeros(()), controller.reset(key_controller))
-        return jax.lax.scan(step, start, (jnp.arange(steps), noise, kicks))[1]
+        first = env.kicked(env.reset(key_reset), start), controller.reset(key_controller)
+        return jax.lax.scan(step, first, (jnp.arange(steps), noise, kicks))[1]
 
     rows, wanted = jax.jit(jax.vmap(episode))(jax.random.split(key, config.episodes))
     rows, wanted = rows.reshape(-1, rows.shape[-1]), wanted.reshape(-1)
@@ -110,24 +112,22 @@ def imitation(config: DemonstrationConfig, params: dict, key: jax.Array) -> Imit
     return Imitation(params, _adam(config).init(params), key, jnp.zeros((), jnp.int32))
 
 
-@partial(jax.jit, static_argnames=("config", "actor", "observe", "updates"))
+@partial(jax.jit, static_argnames=("config", "actor", "updates"))
 def imitate(
     config: DemonstrationConfig,
     actor: Actor,
-    observe: Callable,
     state: Imitation,
-    rows: jax.Array,
+    obs: jax.Array,
     wanted: jax.Array,
     updates: int,
     count: jax.Array | int | None = None,
 ) -> tuple[Imitation, jax.Array]:
     """Fit the actor's greedy action to the wanted ones; returns the state and losses (updates,).
 
-    Minimises the mean squared error of tanh(mean). ``observe`` maps a state (4,) and the previous
-    action () to an observation. ``count`` is the number of rows, if they are not all filled.
+    Minimises the mean squared error of tanh(mean) at the observations (n, observation_size).
+    ``count`` is the number of them, if they are not all filled.
     """
-    count = len(rows) if count is None else count
-    obs = jax.vmap(observe)(rows[:, :4], rows[:, 4])
+    count = len(obs) if count is None else count
     keys = jax.random.split(state.key, config.updates)
 
     def step(carry, key):

@@ -1,9 +1,11 @@
 """The learning environment: a Brax ``Env`` with the surrogate reward of Evolutionary SAC.
 
 Source of the reward: Calì et al., "Evolutionary SAC for the AI Olympics with RealAIGym", 2024
-(arXiv 2409.08938). Observations are those of the policy, followed by the previous action: the
-reward charges the change of the action, so without it the reward, and with it the value, is not
-a function of state and action. See ``networks.Actor`` for what the actor does with it.
+(arXiv 2409.08938). An observation begins with what the policy sees (``seen_size`` entries); what
+follows is for the critics alone: the true state, where the policy's is measured in a random
+scenario, and the previous action, because the reward charges the change of the action, so that
+without it the value is not a function of state and action. See ``networks.Actor`` for why the
+policy does not see it.
 """
 
 import contextlib
@@ -13,14 +15,20 @@ import jax
 import jax.numpy as jnp
 
 from . import designs
+from ._struct import pytree
 from .config import EnvConfig, Reward
 from .plant import forward_kinematics, kinetic_energy, potential_energy, rk4_step
+from .randomisation import LONGEST_DELAY, sample
+from .rollout import actuate, draws, measure
+from .scenario import Scenario
 
 # MuJoCo, which Brax loads, prints what it lacks to standard output.
 with contextlib.redirect_stdout(io.StringIO()):
     from brax.envs.base import Env, State
 
 __all__ = ["DoublePendulum", "EnvConfig", "Reward", "surrogate_reward"]
+
+SCENARIO_DT = 0.002  # s, the steps in which delays, noise and responses of scenarios are meant
 
 
 def surrogate_reward(plant, reward: Reward, x, action, previous_action) -> jax.Array:
@@ -41,9 +49,22 @@ def surrogate_reward(plant, reward: Reward, x, action, previous_action) -> jax.A
     return jnp.maximum(total, reward.floor)
 
 
-class DoublePendulum(Env):
-    """Acrobot or pendubot; ``pipeline_state`` is ``{"x": (4,), "action": ()}``.
+@pytree
+class World:
+    """The random scenario of an episode, and what a rollout in it carries from step to step."""
 
+    scenario: Scenario
+    states: jax.Array  # (LONGEST_DELAY + 1, 4) true states, a ring buffer
+    measured: jax.Array  # (4,)
+    applied: jax.Array  # (2,) N m
+    k: jax.Array  # () int, steps of ``SCENARIO_DT``
+    key: jax.Array
+
+
+class DoublePendulum(Env):
+    """Acrobot or pendubot; ``pipeline_state`` has the true state "x" (4,) and the "action" ().
+
+    With a history it has the "past" (history, 5) too, and the "world" of a randomised episode.
     Episodes never terminate (``done`` is always 0): wrap it in Brax's ``EpisodeWrapper`` or
     count steps; time limits truncate.
     """
@@ -53,34 +74,91 @@ class DoublePendulum(Env):
         self.plant = designs.competition(config.robot, config.torque_limit)
         self.driven = jnp.arange(2) == designs.active_joint(config.robot)
 
-    def observe(self, x: jax.Array, action: jax.Array) -> jax.Array:
-        """Observation of the state, then the previous action: (observation.size + 1,)."""
-        return jnp.append(self.config.observation(x), action)
+    def observe(self, now: dict) -> jax.Array:
+        """Observation (observation_size,) of a ``pipeline_state``."""
+        x, view = now["x"], self.config.observation
+        if not self.config.randomised:
+            return jnp.append(view(x, now.get("past")), now["action"])
+        seen = view(now["world"].measured, now.get("past"))
+        return jnp.concatenate([seen, view.of_state(x), now["action"][None]])
 
     def reset(self, rng: jax.Array) -> State:
-        """A new episode, hanging at rest; ``rng`` has nothing to decide."""
-        x, action, zero = jnp.zeros(4), jnp.zeros(()), jnp.zeros(())
-        return State({"x": x, "action": action}, self.observe(x, action), zero, zero, {}, {})
+        """A new episode, hanging at rest; ``rng`` draws the scenario, if it is a random one."""
+        x, zero = jnp.zeros(4), jnp.zeros(())
+        now = {"x": x, "action": zero}
+        if self.config.observation.history:
+            now["past"] = jnp.zeros((self.config.observation.history, 5))
+        if self.config.randomised:
+            key_scenario, key_start, key = jax.random.split(rng, 3)
+            scenario = sample(self.plant, key_scenario, self.config.randomised)
+            states, k = jnp.zeros((LONGEST_DELAY + 1, 4)), jnp.zeros((), jnp.int32)
+            z = jax.tree.map(lambda z: z[0], draws(scenario, key_start, None, 1, x.dtype))
+            states, measured = measure(scenario, states, k, x, z)
+            now["world"] = World(scenario, states, measured, jnp.zeros(2), k, key)
+        return State(now, self.observe(now), zero, zero, {}, {})
 
     def advance(self, x: jax.Array, previous_action: jax.Array, action: jax.Array):
         """Next state (4,) and reward () of holding ``action`` () in [-1, 1] for one period."""
-        u = jnp.where(self.driven, self.config.torque_limit * action, 0.0)
-        x_next = rk4_step(self.plant, x, u, self.config.dt)
-        reward = surrogate_reward(self.plant, self.config.reward, x_next, action, previous_action)
-        return x_next, reward
+        x_next = rk4_step(self.plant, x, self._torque(action), self.config.dt)
+        return x_next, self._reward(x_next, action, previous_action)
 
     def step(self, state: State, action: jax.Array) -> State:
         """One control period; ``action`` (1,) is clipped to [-1, 1] and held."""
         a = jnp.clip(action[0], -1.0, 1.0)
-        x, reward = self.advance(state.pipeline_state["x"], state.pipeline_state["action"], a)
-        return state.replace(
-            pipeline_state={"x": x, "action": a}, obs=self.observe(x, a), reward=reward
-        )
+        now = dict(state.pipeline_state)
+        x, previous = now["x"], now["action"]
+        if "past" in now:
+            seen = now["world"].measured if "world" in now else x
+            now["past"] = jnp.concatenate([jnp.append(seen, a)[None], now["past"][:-1]])
+        if "world" in now:
+            x, now["world"] = self._through(now["world"], x, a)
+            reward = self._reward(x, a, previous)
+        else:
+            x, reward = self.advance(x, previous, a)
+        now |= {"x": x, "action": a}
+        return state.replace(pipeline_state=now, obs=self.observe(now), reward=reward)
+
+    def kicked(self, state: State, change: jax.Array) -> State:
+        """The same with ``change`` (4,) added to the true state; in a scenario measured later."""
+        now = dict(state.pipeline_state)
+        now["x"] = now["x"] + change
+        return state.replace(pipeline_state=now, obs=self.observe(now))
+
+    def _torque(self, action):
+        return jnp.where(self.driven, self.config.torque_limit * action, 0.0)
+
+    def _reward(self, x, action, previous_action):
+        return surrogate_reward(self.plant, self.config.reward, x, action, previous_action)
+
+    def _through(self, world: World, x: jax.Array, action: jax.Array) -> tuple[jax.Array, World]:
+        """One control period in a scenario, by the parts of a step of ``rollout``."""
+        scenario, command = world.scenario, self._torque(action)
+        steps = max(round(self.config.dt / SCENARIO_DT), 1)
+        dt = self.config.dt / steps
+        key, key_noise = jax.random.split(world.key)
+
+        def step(carry, z):
+            x, applied, states, k, _ = carry
+            applied = actuate(scenario, command, applied, k * dt, z)
+            x = rk4_step(scenario.plant, x, applied, dt)
+            states, measured = measure(scenario, states, k + 1, x, z)
+            return (x, applied, states, k + 1, measured), None
+
+        start = (x, world.applied, world.states, world.k, world.measured)
+        noise = draws(scenario, key_noise, None, steps, x.dtype)
+        (x, applied, states, k, measured), _ = jax.lax.scan(step, start, noise)
+        return x, World(scenario, states, measured, applied, k, key)
+
+    @property
+    def seen_size(self) -> int:
+        """How much of the observation, from the front, the policy sees."""
+        return self.config.observation.size
 
     @property
     def observation_size(self) -> int:
-        """Length of the observation, the previous action included."""
-        return self.config.observation.size + 1
+        """Length of the observation."""
+        true = self.config.observation.state_size if self.config.randomised else 0
+        return self.seen_size + true + 1
 
     @property
     def action_size(self) -> int:

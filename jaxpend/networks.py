@@ -33,17 +33,18 @@ class Trunk(nn.Module):
 class Actor(nn.Module):
     """Mean and log standard deviation of the action before the tanh.
 
-    It does not see the last entry of the observation, the previous action: the reward depends on
-    it, so the critics need it, but a policy that feeds its own action back acts differently at
-    500 Hz than at the 100 Hz it was trained at.
+    It sees the first ``seen`` entries of the observation, not what is for the critics alone, such
+    as the previous action: the reward depends on it, but a policy that feeds its last action back
+    acts differently at 500 Hz than at the 100 Hz it was trained at.
     """
 
     hidden: Sequence[int]
     activation: str
+    seen: int
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
-        h = Trunk(self.hidden, self.activation)(obs[..., :-1])
+        h = Trunk(self.hidden, self.activation)(obs[..., : self.seen])
         mean = nn.Dense(1, name="mean")(h)
         log_std = nn.Dense(1, name="log_std")(h)
         return mean, jnp.clip(log_std, *LOG_STD_RANGE)

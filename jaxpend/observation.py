@@ -37,24 +37,47 @@ KINDS = {"wrapped": (_wrapped, 4), "sincos": (_sincos, 6)}
 
 @dataclasses.dataclass(frozen=True)
 class Observation:
-    """How a state (4,) becomes an observation (``size``,).
+    """How a state (4,), and what came before it, become an observation (``size``,).
 
-    Raises ``JaxpendError`` for an unknown kind or a velocity scale that is not positive.
+    Raises ``JaxpendError`` for an unknown kind, a velocity scale that is not positive, or a
+    negative history.
     """
 
     kind: str = "sincos"
     max_velocity: float = 20.0  # rad/s, velocities are divided by it
+    history: int = 0  # past states and actions that are seen too, one control period apart
 
     def __post_init__(self):
         choose("observation kind", self.kind, KINDS)
         if not self.max_velocity > 0:
             raise JaxpendError(f"max_velocity is {self.max_velocity} rad/s; it must be positive")
+        if self.history < 0:
+            raise JaxpendError(f"history is {self.history}; it must not be negative")
 
     @property
     def size(self) -> int:
         """Length of the observation."""
+        return self.state_size * (1 + self.history) + self.history
+
+    @property
+    def state_size(self) -> int:
+        """Length of what is seen of one state."""
         return KINDS[self.kind][1]
 
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Observation of one state."""
+    def of_state(self, x: jax.Array) -> jax.Array:
+        """What is seen of a state (4,): (``state_size``,)."""
         return KINDS[self.kind][0](x, self.max_velocity)
+
+    def __call__(self, x: jax.Array, past: jax.Array | None = None) -> jax.Array:
+        """Observation of a state (4,) and of ``past`` (history, 5), if there is any history.
+
+        A row of ``past`` is a state and the action in it, the newest first.
+        """
+        now = self.of_state(x)
+        if not self.history:
+            return now
+        import jax
+        import jax.numpy as jnp
+
+        before = jax.vmap(lambda row: jnp.append(self.of_state(row[:4]), row[4]))(past)
+        return jnp.concatenate([now, before.ravel()])

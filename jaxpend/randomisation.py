@@ -38,14 +38,16 @@ def _vary_plant(plant: Plant, which: jax.Array, amount: jax.Array) -> Plant:
     )
 
 
-def sample(plant: Plant, key: jax.Array) -> Scenario:
+def sample(plant: Plant, key: jax.Array, share: float = 1.0) -> Scenario:
     """A scenario with one random imperfection; ``key`` is consumed.
 
     A sixth each: a model parameter, velocity noise, torque noise, torque response, delay,
-    disturbance pulses. ``plant`` is the nominal one.
+    disturbance pulses. ``plant`` is the nominal one; all but a ``share`` of the scenarios are
+    nominal too.
     """
-    key_kind, key_which, key_amount, key_pulses = jax.random.split(key, 4)
+    key_kind, key_which, key_amount, key_pulses, key_share = jax.random.split(key, 5)
     kind = jax.random.randint(key_kind, (), 0, 6)
+    kind = jnp.where(jax.random.uniform(key_share) < share, kind, -1)
     which = jnp.where(kind == 0, jax.random.randint(key_which, (), 0, 10), -1)
     amount = jax.random.uniform(key_amount, minval=-1.0, maxval=1.0)
     share = (amount + 1) / 2  # the same draw on [0, 1]

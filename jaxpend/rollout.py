@@ -46,7 +46,7 @@ def time_stamps(dt: float, duration: float) -> np.ndarray:
     return t[: int(np.argmax(t >= duration)) + 1]
 
 
-def _draws(scenario: Scenario, key, normals, steps: int, dtype) -> dict[str, jax.Array]:
+def draws(scenario: Scenario, key, normals, steps: int, dtype) -> dict[str, jax.Array]:
     """Standard normals (steps, columns) of each noise that the scenario has, and of no other.
 
     Drawn for all steps at once: a draw in every step cost more than the physics.
@@ -59,7 +59,7 @@ def _draws(scenario: Scenario, key, normals, steps: int, dtype) -> dict[str, jax
     return {name: jax.random.normal(keys[name], (steps, columns[name]), dtype) for name in noisy}
 
 
-def _measure(scenario: Scenario, history, k, x, z):
+def measure(scenario: Scenario, history, k, x, z):
     """Delayed and noisy measurement; returns it with the updated ring buffer of past states."""
     measured = x
     if scenario.delay is not None:
@@ -72,7 +72,7 @@ def _measure(scenario: Scenario, history, k, x, z):
     return history, measured
 
 
-def _actuate(scenario: Scenario, command, applied_before, t_pulse, z):
+def actuate(scenario: Scenario, command, applied_before, t_pulse, z):
     """Torque that reaches the joints: response, noise, limit, disturbance, in this order."""
     u = command
     if scenario.responsiveness is not None:
@@ -98,15 +98,15 @@ def _closed_loop(scenario, controller, key, dt, duration, integrator, delay_slot
         "k": np.arange(steps),
         "t": stamps[:-1].astype(dtype),
         "t_pulse": ((stamps[:-1] / dt).astype(int) * dt).astype(dtype),
-        "z": _draws(scenario, noise_key, normals, steps, dtype),
+        "z": draws(scenario, noise_key, normals, steps, dtype),
     }
 
     def step(carry, now):
         x, u, memory, history = carry
-        history, measured = _measure(scenario, history, now["k"], x, now["z"])
+        history, measured = measure(scenario, history, now["k"], x, now["z"])
         memory, command = controller(memory, now["t"], measured)
         command = jnp.asarray(command, dtype)
-        u = _actuate(scenario, command, u, now["t_pulse"], now["z"])
+        u = actuate(scenario, command, u, now["t_pulse"], now["z"])
         x_next = integrator(plant, x, u, dt)
         if scenario.process_noise is not None:
             x_next = x_next + scenario.process_noise * now["z"]["process_noise"]

@@ -22,14 +22,11 @@ from .networks import Actor, TwinCritic, constant_log_std, sample_action, to_pol
 __all__ = ["SACConfig", "SACState", "greedy_policy", "init", "train_chunk"]
 
 
-ROW = 4 + 1 + 1 + 1 + 4
-
-
 @pytree
 class Replay:
-    """Ring buffer of transitions; observations are made from states when a batch is drawn."""
+    """Ring buffer of transitions: observation, action, scaled reward, next observation."""
 
-    rows: jax.Array  # (capacity, ROW) state, previous action, action, scaled reward, next state
+    rows: jax.Array  # (capacity, 2 observation_size + 2)
     position: jax.Array  # () int, next row to write
     size: jax.Array  # () int, rows filled
 
@@ -38,7 +35,7 @@ class Replay:
 class Demonstrations:
     """Rows of demonstrations; as many as there could be, so that all seeds compile the same."""
 
-    rows: jax.Array  # (capacity, ROW + 1) replay rows and wanted actions, then zeros
+    rows: jax.Array  # (capacity, 2 observation_size + 3) as in Replay, and wanted actions
     size: jax.Array  # () int, rows filled
 
 
@@ -64,7 +61,8 @@ class SACState:
 
 def networks(config: SACConfig) -> tuple[Actor, TwinCritic]:
     """The actor and the critics of a configuration."""
-    actor = Actor(config.actor_hidden, config.activation)
+    seen = DoublePendulum(config.env).seen_size
+    actor = Actor(config.actor_hidden, config.activation, seen)
     return actor, TwinCritic(config.critic_hidden, config.activation, config.critic_layer_norm)
 
 
@@ -111,9 +109,9 @@ def begin(config: SACConfig, key: jax.Array) -> tuple[SACState, Imitation | None
 def imitate_chunk(config: SACConfig, state: SACState, learner: Imitation, updates: int):
     """``updates`` steps of imitating the demonstrations; returns the learner and its mean loss."""
     recipe, shown = config.demonstrations, state.demonstrations
-    actor, observe = networks(config)[0], DoublePendulum(config.env).observe
-    rows, wanted = shown.rows[:, :ROW], shown.rows[:, ROW]
-    learner, losses = imitate(recipe, actor, observe, learner, rows, wanted, updates, shown.size)
+    actor, size = networks(config)[0], DoublePendulum(config.env).observation_size
+    obs, wanted = shown.rows[:, :size], shown.rows[:, -1]
+    learner, losses = imitate(recipe, actor, learner, obs, wanted, updates, shown.size)
     return learner, losses.mean()
 
 
@@ -152,7 +150,7 @@ def _fresh(config: SACConfig, key: jax.Array) -> SACState:
         critic_opt=opt.init(critic_params),
         temperature_opt=opt.init(log_temperature),
         demonstrations=None,
-        replay=Replay(jnp.zeros((capacity, ROW)), zero, zero),
+        replay=Replay(jnp.zeros((capacity, 2 * env.observation_size + 2)), zero, zero),
         env_x=jax.vmap(env.reset)(jax.random.split(key_env, config.num_envs)),
         # Spread out, so that the environments are not all in the same phase of an episode.
         env_time=jax.random.randint(key_time, (config.num_envs,), 0, config.env.episode_steps),
@@ -171,17 +169,17 @@ def soft_value(actor_params, critic_params, config: SACConfig, log_temperature, 
 
 
 def update(config: SACConfig, state: SACState, batch: jax.Array, key: jax.Array):
-    """One gradient step on critics, actor and temperature from replay rows (n, ROW or ROW + 1).
+    """One gradient step on critics, actor and temperature from a batch of ``sample``.
 
     The critics minimise the squared distance to ``r + gamma V(s')``, V being the soft value under
     the target critics. The actor maximises the soft value under the critics, less the weighted
     distance to demonstrated actions.
     """
-    env, opt, (actor, critic_net) = DoublePendulum(config.env), optimizer(config), networks(config)
+    opt, (actor, critic_net) = optimizer(config), networks(config)
     key_critic, key_actor = jax.random.split(key)
-    x, previous, action, reward, next_x, wanted = jnp.split(batch, (4, 5, 6, 7, ROW), axis=1)
-    observe = jax.vmap(env.observe)
-    obs, next_obs = observe(x, previous[:, 0]), observe(next_x, action[:, 0])
+    n = DoublePendulum(config.env).observation_size
+    columns = (n, n + 1, n + 2, 2 * n + 2)
+    obs, action, reward, next_obs, wanted = jnp.split(batch, columns, axis=1)
     next_value, _ = soft_value(
         state.actor, state.target, config, state.log_temperature, next_obs, key_critic
     )
@@ -236,16 +234,8 @@ def interact(config: SACConfig, state: SACState, key: jax.Array):
     uniform = jax.random.uniform(key_uniform, action.shape, minval=-1.0, maxval=1.0)
     action = jnp.where(state.env_steps < config.warmup_steps, uniform, action)
     after = jax.vmap(env.step)(before, action)
-    rows = jnp.concatenate(
-        [
-            before.pipeline_state["x"],
-            before.pipeline_state["action"][:, None],
-            action,
-            config.reward_scale * after.reward[:, None],
-            after.pipeline_state["x"],
-        ],
-        axis=1,
-    )
+    reward = config.reward_scale * after.reward[:, None]
+    rows = jnp.concatenate([before.obs, action, reward, after.obs], axis=1)
     replay, capacity = state.replay, state.replay.rows.shape[0]
     replay = Replay(
         rows=jax.lax.dynamic_update_slice(replay.rows, rows, (replay.position, 0)),
@@ -270,8 +260,10 @@ def interact(config: SACConfig, state: SACState, key: jax.Array):
 
 
 def sample(config: SACConfig, state: SACState, key: jax.Array) -> jax.Array:
-    """Batches for one vector step, (updates_per_step, batch_size, ROW), or (..., ROW + 1) with
-    demonstrations, which come first; wanted actions are 0 in the other half.
+    """Batches of replay rows for one vector step, (updates_per_step, batch_size, columns).
+
+    With demonstrations they come first, and there is a last column of wanted actions, which are 0
+    in the other half.
     """
 
     def draw(rows, size, key, count):

@@ -88,16 +88,18 @@ def imitation():
     from jaxpend.networks import Actor, to_policy
 
     config = DemonstrationConfig(episodes=150, updates=8000, batch_size=512)
-    env, actor = DoublePendulum(EnvConfig("pendubot")), Actor((64, 64), "tanh")
+    env = DoublePendulum(EnvConfig("pendubot"))
+    actor = Actor((64, 64), "tanh", env.seen_size)
     keys = jax.random.split(jax.random.key(0), 3)
     rows, wanted = swingups(config, env, keys[0], reward_scale=0.1)
     untrained = actor.init(keys[1], jax.numpy.zeros(env.observation_size))
     state = imitation(config, untrained, keys[2])
+    obs = rows[:, : env.observation_size]
     for _ in range(4):
-        state, loss = imitate(config, actor, env.observe, state, rows, wanted, 2000)
+        state, loss = imitate(config, actor, state, obs, wanted, 2000)
     params, error = state.params, loss[-100:].mean()
     return SimpleNamespace(
-        env=env, actor=actor, rows=rows, wanted=wanted, untrained=untrained, params=params,
+        env=env, actor=actor, obs=obs, wanted=wanted, untrained=untrained, params=params,
         error=error, policy=to_policy(params, actor, env.config),
     )  # fmt: skip
 

@@ -13,7 +13,7 @@ from jaxpend.controllers import Feedback, Zero
 from jaxpend.demonstrations import DemonstrationConfig, collect, swingups
 from jaxpend.env import DoublePendulum, EnvConfig
 from jaxpend.networks import to_policy
-from jaxpend.sac import ROW, SACConfig, init
+from jaxpend.sac import SACConfig, init
 from jaxpend.score import official
 
 NOISY = DemonstrationConfig(episodes=4, duration=1.0, action_noise=0.4, kicks=0.5)
@@ -22,7 +22,12 @@ NOISY = DemonstrationConfig(episodes=4, duration=1.0, action_noise=0.4, kicks=0.
 def parts(rows):
     """Columns of replay rows: state, previous action, action, reward, next state."""
     rows = np.asarray(rows)
-    return rows[:, :4], rows[:, 4], rows[:, 5], rows[:, 6], rows[:, 7:]
+
+    def state(obs):  # of cosines, sines, scaled velocities
+        return np.column_stack([np.arctan2(obs[:, 2:4], obs[:, :2]), 20 * obs[:, 4:6]])
+
+    np.testing.assert_array_equal(rows[:, 15], rows[:, 7])
+    return state(rows[:, :7]), rows[:, 6], rows[:, 7], rows[:, 8], state(rows[:, 9:])
 
 
 @pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
@@ -30,7 +35,7 @@ def test_rows_are_exact_transitions_under_noise(robot):
     env = DoublePendulum(EnvConfig(robot))
     law = Feedback(lambda t, x: jnp.full(2, 2.0) * jnp.cos(3 * x[0]))
     rows, wanted = collect(NOISY, env, law, jax.random.key(0), reward_scale=0.1)
-    assert rows.shape == (400, ROW)
+    assert rows.shape == (400, 16)
     x, previous, action, reward, next_x = parts(rows)
     expected, earned = jax.vmap(env.advance)(x, previous, action)
     assert_close(next_x, expected, times=5)
@@ -71,7 +76,7 @@ def test_saturated_labels_are_left_out():
     env = DoublePendulum(EnvConfig())
     law = Feedback(lambda t, x: jnp.where(t < 0.495, 1.5, 9.0) * jnp.ones(2))
     rows, wanted = collect(NOISY, env, law, jax.random.key(0), reward_scale=0.1)
-    assert rows.shape == (4 * 50, ROW)
+    assert rows.shape == (4 * 50, 16)
     assert_close(wanted, np.full(200, 0.5))
     always = Feedback(lambda t, x: jnp.full(2, -3.0))
     with pytest.raises(JaxpendError, match="asks for all the torque all the time"):
@@ -88,10 +93,9 @@ def test_a_controller_that_wants_nothing_is_labelled_so():
 def test_imitation_of_the_swing_up_swings_up(imitation):
     env, actor = imitation.env, imitation.actor
     assert np.abs(imitation.wanted).max() < 0.99
-    observations = jax.vmap(env.observe)(imitation.rows[:, :4], imitation.rows[:, 4])
 
     def error(params):
-        mean, _ = actor.apply(params, observations)
+        mean, _ = actor.apply(params, imitation.obs)
         return np.mean((np.tanh(mean[:, 0]) - imitation.wanted) ** 2)
 
     assert error(imitation.params) < 0.2 * error(imitation.untrained)
@@ -112,12 +116,12 @@ def test_sac_starts_from_the_imitating_actor_and_its_demonstrations():
     untaught = init(alone, jax.random.key(0))
     assert untaught.demonstrations is None
     shown = state.demonstrations
-    x, previous, action, reward, next_x = parts(shown.rows[: shown.size, :ROW])
+    x, previous, action, reward, next_x = parts(shown.rows[: shown.size])
     expected, earned = jax.vmap(DoublePendulum(config.env).advance)(x, previous, action)
     assert_close(next_x, expected, times=5)
     assert_close(reward, config.reward_scale * np.asarray(earned), times=5)
     # The same shape for every seed, however many rows were good enough.
-    assert shown.rows.shape == (2 * 100, ROW + 1)
+    assert shown.rows.shape == (2 * 100, 17)
     assert 100 < shown.size < 200
     assert not np.asarray(shown.rows[shown.size :]).any()
     head = state.actor["params"]["log_std"]
@@ -130,7 +134,7 @@ def test_the_swing_up_is_that_of_the_robot():
     for robot in ("acrobot", "pendubot"):
         env = DoublePendulum(EnvConfig(robot))
         rows, _ = swingups(recipe, env, jax.random.key(0), reward_scale=1.0)
-        upright = np.cos(np.asarray(rows)[-50:, :2]) @ [[-1.0], [1.0]]
+        upright = np.asarray(rows)[-50:, :2] @ [[-1.0], [1.0]]  # cosines
         np.testing.assert_allclose(upright, 2.0, atol=0.05)
 
 

@@ -12,9 +12,13 @@ from brax.envs.wrappers import training
 from conftest import assert_close, both_robots
 
 from jaxpend import JaxpendError, designs
+from jaxpend.controllers import OpenLoop
 from jaxpend.env import DoublePendulum, EnvConfig, Reward, surrogate_reward
 from jaxpend.observation import Observation
 from jaxpend.plant import rk4_step
+from jaxpend.randomisation import sample
+from jaxpend.rollout import rollout
+from jaxpend.scenario import Pulses
 
 LINE = {"acrobot": 0.375, "pendubot": 0.35}
 # The end effector of the second state lies between the lines of the two robots.
@@ -123,10 +127,92 @@ def test_observations_have_the_previous_action_last(kind, size):
     assert env.observation_size == size == state.obs.shape[0]
     assert env.action_size == 1
     assert state.obs[-1] == 0.25
-    near = [env.observe(jnp.array([math.pi, d, 0.0, 0.0]), 0.0) for d in (-1e-4, 1e-4)]
+    near = [
+        env.observe({"x": jnp.array([math.pi, d, 0.0, 0.0]), "action": jnp.zeros(())})
+        for d in (-1e-4, 1e-4)
+    ]
     jump = np.abs(near[1] - near[0]).max()
     # With wrapped angles the goal lies on the wrap; with sines and cosines nothing jumps there.
     np.testing.assert_allclose(jump, 2.0 if kind == "wrapped" else 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("randomised", [0.0, 1.0])
+def test_history_is_what_was_measured_and_done_before_newest_first(randomised):
+    view = Observation(history=2)
+    env = DoublePendulum(EnvConfig("acrobot", observation=view, randomised=randomised))
+    state = env.reset(jax.random.key(3))
+    measured, true, actions = [], [], [0.0]
+    for action in (0.9, -0.5, 0.3, 0.7):
+        now = state.pipeline_state
+        measured.append(now["world"].measured if randomised else now["x"])
+        true.append(now["x"])
+        before = [np.zeros((2, 4)), *np.array(measured)[None, :-1]]
+        before = np.concatenate(before)[:-3:-1]  # hanging at rest before it began
+        pushed = np.append([0.0, 0.0], actions[1:])[:-3:-1]
+        past = [np.append(view.of_state(x), a) for x, a in zip(before, pushed, strict=True)]
+        critics = [view.of_state(true[-1])] if randomised else []
+        expected = [view.of_state(measured[-1]), *past, *critics, [actions[-1]]]
+        assert_close(state.obs, np.concatenate(expected), times=5)
+        assert state.obs.shape == (env.observation_size,)
+        actions.append(action)
+        state = step(env, state, jnp.array([action]))
+    assert env.seen_size == view.size == 6 + 2 * 7
+    assert np.abs(np.array(measured)).max() > 0.1
+
+
+@both_robots
+def test_a_randomised_episode_is_a_rollout_in_its_scenario(robot):
+    env = DoublePendulum(EnvConfig(robot, randomised=1.0))
+    wrong = sample(env.plant, jax.random.key(1))
+    wrong = wrong.replace(
+        plant=env.plant.replace(mass=env.plant.mass * 1.1),
+        responsiveness=jnp.asarray(0.5),
+        delay=jnp.full(4, 7),
+        measurement_noise=jnp.zeros(4),
+        torque_noise=jnp.zeros(2),
+        pulses=Pulses(jnp.full((2, 1), 0.1), jnp.full((2, 1), 0.05), jnp.array([[0.4], [-0.2]])),
+    )
+    state = env.reset(jax.random.key(0))
+    now = state.pipeline_state
+    state = state.replace(
+        pipeline_state=now | {"world": now["world"].replace(scenario=wrong, measured=now["x"])}
+    )
+    actions = np.sin(np.arange(30.0))
+    torque = 3.0 * actions[:, None] * (np.arange(2) == designs.active_joint(robot))
+    held = OpenLoop(jnp.arange(30) * 0.01 - 1e-4, jnp.asarray(torque, jnp.float32))
+    run = rollout(wrong, held, jax.random.key(0), duration=0.3)
+    for k, action in enumerate(actions):
+        state = step(env, state, jnp.array([action], jnp.float32))
+        now = state.pipeline_state
+        assert_close(now["x"], run.x[5 * (k + 1)], times=50)
+        if k < 29:
+            assert_close(now["world"].measured, run.x_measured[5 * (k + 1)], times=50)
+        np.testing.assert_array_equal(state.obs[:6], Observation()(now["world"].measured))
+        np.testing.assert_array_equal(state.obs[6:12], Observation()(now["x"]))
+    assert np.abs(now["x"] - now["world"].measured).max() > 0.01
+
+
+def test_noise_of_a_scenario_is_measured_and_drawn_anew():
+    env = DoublePendulum(EnvConfig(randomised=1.0))
+    state = env.reset(jax.random.key(0))
+    now = state.pipeline_state
+    scenario = sample(env.plant, jax.random.key(0), 0.0)
+    scenario = scenario.replace(measurement_noise=jnp.array([0.0, 0.1, 0.2, 0.3]))
+    state = state.replace(pipeline_state=now | {"world": now["world"].replace(scenario=scenario)})
+    ends = jax.lax.scan(lambda s, _: (env.step(s, jnp.zeros(1)),) * 2, state, length=400)[1]
+    now = ends.pipeline_state
+    error = np.asarray(now["world"].measured - now["x"])
+    assert_close(now["x"], np.zeros((400, 4)))
+    np.testing.assert_allclose(error.std(axis=0), [0.0, 0.1, 0.2, 0.3], rtol=0.15)
+    np.testing.assert_allclose(np.corrcoef(error[1:, 1], error[:-1, 1])[0, 1], 0.0, atol=0.2)
+
+
+def test_every_episode_has_its_own_scenario():
+    env = DoublePendulum(EnvConfig(randomised=0.5))
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 64))
+    kinds = jax.tree.leaves(states.pipeline_state["world"].scenario)
+    differing = np.array([[not np.array_equal(v, leaf[0]) for v in leaf] for leaf in kinds])
+    assert differing.any(axis=1).sum() > 8
 
 
 def batched_legacy(env):
@@ -170,6 +256,7 @@ def test_episode_steps():
         ({"dt": math.nan}, "dt is nan; it must be positive"),
         ({"duration": -1.0}, "duration is -1.0; it must be positive"),
         ({"max_speed": 0.0}, "max_speed is 0.0; it must be positive"),
+        ({"randomised": 1.5}, "randomised is 1.5; it is a share, from 0 to 1"),
     ],
 )
 def test_senseless_values_are_one_sentence(values, words):

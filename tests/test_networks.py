@@ -20,7 +20,7 @@ sample = jax.jit(sample_action)
 @pytest.fixture(scope="module")
 def actor():
     """A small actor and its parameters, log standard deviations spread out over observations."""
-    net = Actor((16, 8), "tanh")
+    net = Actor((16, 8), "tanh", 6)
     params = net.init(jax.random.key(0), OBS)
     params["params"]["log_std"]["bias"] += 0.3
     return net, params
@@ -124,12 +124,11 @@ def test_critics_are_two_and_see_everything(layer_norm):
 @pytest.mark.parametrize("kind", ["wrapped", "sincos"])
 def test_policy_acts_as_the_actors_mean(robot, activation, kind):
     env = EnvConfig(robot, torque_limit=2.5, dt=0.02, observation=Observation(kind))
-    observe = jax.vmap(DoublePendulum(env).observe)
-    obs = observe(STATES, jnp.zeros(5))
-    net = Actor((16, 8), activation)
+    obs = jax.vmap(DoublePendulum(env).observe)({"x": STATES, "action": jnp.zeros(5)})
+    net = Actor((16, 8), activation, env.observation.size)
     params = net.init(jax.random.key(0), obs)
     policy = to_policy(params, net, env)
-    torque = jax.vmap(lambda x: policy(None, 0.0, x)[1])(STATES)
+    torque = jax.vmap(lambda x: policy((None, None), 0.0, x)[1])(STATES)
     mean, _ = net.apply(params, obs)
     assert_close(torque[:, active_joint(robot)], 2.5 * np.tanh(mean[:, 0]), times=5)
     assert not torque[:, 1 - active_joint(robot)].any()

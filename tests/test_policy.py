@@ -12,7 +12,9 @@ from conftest import assert_close, both_robots
 from jaxpend import JaxpendError, Policy, load_policy, save_policy
 from jaxpend.controllers.policy import read_header
 from jaxpend.designs import active_joint
+from jaxpend.env import DoublePendulum, EnvConfig
 from jaxpend.observation import Observation
+from jaxpend.rollout import rollout
 
 KEY = jax.random.key(0)
 STATE = np.array([3.5, -7.0, 2.0, -30.0], "f4")
@@ -23,13 +25,13 @@ NUMPY_ACTIVATIONS = {
 }
 
 
-def random_policy(robot="pendubot", kind="sincos", activation="relu", sizes=(16, 8)):
+def random_policy(robot="pendubot", kind="sincos", activation="relu", sizes=(16, 8), history=0):
     """A small network with weights from a fixed seed."""
     rng = np.random.default_rng(0)
-    observation = Observation(kind)
+    observation = Observation(kind, history=history)
     widths = [observation.size, *sizes, 1]
     layers = tuple(
-        (rng.normal(size=(a, b)).astype("f4") / 3, rng.normal(size=b).astype("f4") / 3)
+        (jnp.asarray(rng.normal(size=(a, b)) / 3, "f4"), jnp.asarray(rng.normal(size=b) / 3, "f4"))
         for a, b in itertools.pairwise(widths)
     )
     limit = jnp.asarray(3.0, jnp.float32)
@@ -56,7 +58,7 @@ def numpy_torque(policy, observation):
 def test_torque_is_that_of_the_network_on_the_driven_joint(robot, kind, activation):
     policy = random_policy(robot, kind, activation)
     carry, torque = policy(policy.reset(KEY), 0.0, jnp.asarray(STATE))
-    assert carry is None
+    assert carry == (None, None)
     observation = policy.observation(STATE)
     assert observation.shape == (policy.observation.size,)
     assert_close(torque[active_joint(robot)], numpy_torque(policy, observation))
@@ -86,13 +88,50 @@ def test_action_noise_is_drawn_before_the_squashing_and_anew_each_step():
     np.testing.assert_allclose(noise.std(), 0.1, rtol=0.2)
     np.testing.assert_allclose(noise.mean(), 0.0, atol=0.03)
     assert len(np.unique(noise)) > 190
-    greedy = random_policy()(None, 0.0, STATE)[1]
-    assert_close(step(quiet, KEY)[1], greedy)
+    greedy = random_policy()((None, None), 0.0, STATE)[1]
+    assert_close(step(quiet, quiet.reset(KEY))[1], greedy)
+
+
+@pytest.mark.parametrize("calls", [1, 5, 10])  # a period of 10 ms
+def test_memory_goes_back_whole_periods_however_often_it_is_asked(calls):
+    policy, rng = random_policy(history=3), np.random.default_rng(1)
+    memory, dt = policy.reset(KEY)[1], 0.01 / calls
+    states = rng.normal(size=(6 * calls, 4)).astype("f4")
+    actions = rng.uniform(-1, 1, 6 * calls).astype("f4")
+    past = jax.jit(lambda memory, t, x: memory.past(3, 0.01, t, x))
+    for k, (x, action) in enumerate(zip(states, actions, strict=True)):
+        seen = past(memory, np.float32(k * dt), x)
+        ago = k - calls * np.arange(1, 4)
+        # Before the first call: the first state, and no action.
+        np.testing.assert_array_equal(seen[:, :4], states[np.maximum(ago, 0)])
+        padded = np.append(np.zeros(3 * calls), actions)
+        expected = [padded[3 * calls + a : 4 * calls + a].mean() for a in ago]
+        assert_close(seen[:, 4], expected, times=5)
+        memory = memory.after(np.float32(k * dt), x, action)
 
 
 @both_robots
-def test_file_round_trip(tmp_path, robot):
-    policy, path = random_policy(robot, "sincos", "tanh"), tmp_path / "policy.npz"
+def test_a_rollout_at_the_period_of_training_is_an_episode_of_the_environment(robot):
+    policy = random_policy(robot, activation="tanh", history=2)
+    env = DoublePendulum(EnvConfig(robot, observation=policy.observation))
+    run = jax.jit(lambda: rollout(env.plant, policy, KEY, dt=0.01, duration=0.4))()
+    state, step = env.reset(KEY), jax.jit(env.step)
+    for k in range(40):
+        wanted = numpy_torque(policy, state.obs[: env.seen_size])
+        assert_close(run.u[k][active_joint(robot)], wanted, times=20)
+        state = step(state, jnp.array([wanted / 3.0], jnp.float32))
+    assert_close(run.x[40], state.pipeline_state["x"], times=20)
+    forgetful = policy.replace(layers=((policy.layers[0][0].at[6:].set(0), policy.layers[0][1]),
+                                       *policy.layers[1:]))  # fmt: skip
+    other = rollout(env.plant, forgetful, KEY, dt=0.01, duration=0.4)
+    assert np.abs(other.u - run.u).max() > 0.1
+
+
+@both_robots
+@pytest.mark.parametrize("history", [0, 2])
+def test_file_round_trip(tmp_path, robot, history):
+    policy = random_policy(robot, "sincos", "tanh", history=history)
+    path = tmp_path / "policy.npz"
     save_policy(path, policy, {"seed": 7})
     loaded = load_policy(path, robot=robot)
     assert jax.tree.structure(loaded) == jax.tree.structure(policy)
@@ -167,3 +206,8 @@ def test_missing_files_and_the_other_robots_policy(tmp_path):
 def test_velocity_scale_must_be_positive(scale):
     with pytest.raises(JaxpendError, match="must be positive"):
         Observation("sincos", scale)
+
+
+def test_history_must_not_be_negative():
+    with pytest.raises(JaxpendError, match="history is -1; it must not be negative"):
+        Observation(history=-1)

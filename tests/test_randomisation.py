@@ -63,3 +63,11 @@ def test_ranges_are_those_of_the_benchmarks_grids(scenarios):
     assert scenarios.delay.max() == LONGEST_DELAY
     assert not scenarios.torque_noise[:, 0].any()
     assert not scenarios.measurement_noise[:, :2].any()
+
+
+def test_all_but_a_share_are_nominal():
+    keys = jax.random.split(jax.random.key(5), 400)
+    some = jax.jit(lambda share: jax.vmap(lambda key: sample(PLANT, key, share))(keys))
+    wrong = [off(jax.tree.map(np.asarray, some(share))).any(axis=0) for share in (0.0, 0.3)]
+    assert not wrong[0].any()
+    np.testing.assert_allclose(wrong[1].mean(), 0.3, atol=0.1)

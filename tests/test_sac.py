@@ -16,9 +16,10 @@ from conftest import assert_close
 from jaxpend import JaxpendError, sac
 from jaxpend.env import EnvConfig, Reward
 from jaxpend.networks import constant_log_std
-from jaxpend.sac import ROW, SACConfig
+from jaxpend.sac import SACConfig
 
 KEY = jax.random.key(0)
+ROW = 12  # observation (state, previous action), action, reward, next observation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Probe:
     episode_steps: int = 8
     max_speed: float = math.inf
 
-    observation_size = 5
+    observation_size, seen_size = 5, 4
 
     def make(self):
         return self
@@ -172,9 +173,7 @@ def test_critics_learn_towards_the_lower_target_value_of_the_next_observation():
     shifted = jax.tree.map(lambda w: w + 0.3, state.target)
     state = with_actor(state, -10.0, -20.0).replace(target=shifted)  # no noise, no entropy
     after, metrics = update(CREDIT, state, batch, KEY)
-    x, previous, action, reward, next_x = np.split(batch, (4, 5, 6, 7), axis=1)
-    obs = np.concatenate([x, previous], axis=1)
-    next_obs = np.concatenate([next_x, action], axis=1)
+    obs, action, reward, next_obs = np.split(batch, (5, 6, 7), axis=1)
     critic = sac.networks(CREDIT)[1]
     next_action = greedy(CREDIT, state, next_obs)[:, None]
     q_next = np.asarray(critic.apply(state.target, next_obs, next_action))
@@ -245,7 +244,8 @@ def test_replay_holds_the_last_transitions_as_they_were():
         assert_close(mean_reward, np.mean(10 * x[:, 0] + action), times=5)
         # The true next state, also where the episode was cut and a new one began.
         step = np.stack([action, previous, np.zeros(4), -np.ones(4)], axis=1)
-        assert_close(rows[:, 7:], x + step)
+        assert_close(rows[:, 7:11], x + step)
+        np.testing.assert_array_equal(rows[:, 11], action)
         wanted = greedy(REPLAY, before, before.env_x.obs)
         uniform = 4 * k < REPLAY.warmup_steps
         assert np.allclose(action, wanted, atol=1e-3) != uniform
@@ -259,7 +259,7 @@ def test_episodes_end_by_time_and_by_speed_and_start_anew():
     cut_by, starts = set(), []
     for before, after, _ in run_interaction(12):
         row = int(before.env_steps) % 12
-        arrived = np.asarray(after.replay.rows[row : row + 4, 7:])
+        arrived = np.asarray(after.replay.rows[row : row + 4, 7:11])
         late = np.asarray(before.env_time) + 1 >= 5
         fast = np.abs(arrived[:, 2:]).max(axis=1) > 3.5
         ended = late | fast

@@ -26,12 +26,49 @@ FORMAT = 1
 ACTIVATIONS = {name: getattr(jax.nn, name) for name in config.ACTIVATIONS}
 
 
+FASTEST = 0.001  # s, the shortest time between calls at which a history still goes back far enough
+
+
+@pytree
+class Memory:
+    """The calls of a policy so far, the newest first; as many as its history may need."""
+
+    x: jax.Array  # (N, 4) measured states
+    actions: jax.Array  # (N,) sum of the actions of all calls before that one
+    total: jax.Array  # () sum of the actions of all calls
+    t: jax.Array  # () s, of the last call; -inf before the first
+
+    def past(self, history: int, period: float, t: jax.Array, x: jax.Array) -> jax.Array:
+        """What an ``Observation`` calls ``past``, (history, 5), at time ``t`` and state ``x``.
+
+        States are those of 1, 2, ... periods ago; actions the means over the periods from then
+        on. Called once a period, as in training, those are the actions there were; called more
+        often they change as smoothly as the mean. Before the first call the state was the same,
+        and the action 0.
+        """
+        calls = jnp.round(period / (t - self.t)).astype(jnp.int32)  # a period; the first time 0
+        calls = jnp.clip(calls, 1, len(self.x) // history)
+        ago = jnp.arange(1, history + 1) * calls - 1
+        states = jnp.where(jnp.isfinite(self.t), self.x[ago], x)
+        sums = jnp.append(self.total, self.actions[ago])
+        return jnp.column_stack([states, (sums[:-1] - sums[1:]) / calls])
+
+    def after(self, t: jax.Array, x: jax.Array, action: jax.Array) -> "Memory":
+        """With a call at time ``t`` in state ``x`` that acted so."""
+        states = jnp.concatenate([x[None], self.x[:-1]])
+        states = jnp.where(jnp.isfinite(self.t), states, x)  # the first state was there before
+        sums = jnp.append(self.total, self.actions[:-1])
+        return Memory(states, sums, self.total + action, jnp.asarray(t, self.t.dtype))
+
+
 @pytree
 class Policy:
     """Multi-layer perceptron from an observation of the state to the driven joint's torque.
 
-    ``action_noise`` is the standard deviation of the noise added to the action before the tanh
-    (SNES trains with it); None means greedy and costs nothing.
+    With ``observation.history`` it sees past states and actions too, as far apart as in training
+    (``control_dt``), however often it is called. ``action_noise`` is the standard deviation of
+    the noise added to the action before the tanh (SNES trains with it); None means greedy and
+    costs nothing.
     """
 
     SEARCHED: ClassVar = {"layers": WEIGHT}
@@ -43,27 +80,38 @@ class Policy:
     activation: str = static(default="relu")
     control_dt: float = static(default=0.01)  # s, the period it was trained at
 
-    def pre_action(self, x: jax.Array) -> jax.Array:
-        """The action before the tanh, scalar, for a measured state (4,)."""
-        h = self.observation(x)
+    def pre_action(self, x: jax.Array, past: jax.Array | None = None) -> jax.Array:
+        """The action before the tanh, scalar, for a measured state (4,) and ``Memory.past``."""
+        h = self.observation(x, past)
         *hidden, (kernel, bias) = self.layers
         for w, b in hidden:
             h = ACTIVATIONS[self.activation](h @ w + b)
         return (h @ kernel + bias)[0]
 
-    def reset(self, key: jax.Array) -> jax.Array | None:
-        """The key for the action noise, or nothing."""
-        return None if self.action_noise is None else key
+    def reset(self, key: jax.Array) -> tuple[jax.Array | None, Memory | None]:
+        """The key for the action noise and the memory, or None where there is no such thing."""
+        memory, dtype = None, jnp.result_type(float)
+        if history := self.observation.history:
+            calls = history * max(round(self.control_dt / FASTEST), 1)
+            states, zero = jnp.zeros((calls, 4), dtype), jnp.zeros((), dtype)
+            memory = Memory(states, jnp.zeros(calls, dtype), zero, zero - jnp.inf)
+        return None if self.action_noise is None else key, memory
 
     def __call__(self, carry, t, x):
         """Torque (2,), N m, zero on the passive joint."""
-        pre = self.pre_action(x)
+        (key, memory), past = carry, None
+        if memory is not None:
+            past = memory.past(self.observation.history, self.control_dt, t, x)
+        pre = self.pre_action(x, past)
         if self.action_noise is not None:
-            carry, key = jax.random.split(carry)
-            pre = pre + self.action_noise * jax.random.normal(key, (), pre.dtype)
-        torque = self.torque_limit * jnp.tanh(pre)
+            key, key_noise = jax.random.split(key)
+            pre = pre + self.action_noise * jax.random.normal(key_noise, (), pre.dtype)
+        action = jnp.tanh(pre)
+        if memory is not None:
+            memory = memory.after(t, x, action)
+        torque = self.torque_limit * action
         on_joint = np.arange(2) == active_joint(self.robot)
-        return carry, jnp.where(on_joint, torque, jnp.zeros_like(torque))
+        return (key, memory), jnp.where(on_joint, torque, jnp.zeros_like(torque))
 
 
 def change_policies(controller: Any, change: Callable[[Policy], Policy]) -> tuple[Any, int]:
