@@ -14,8 +14,9 @@ from training_runs import OPTIONS, arrays_of, result_of, rows_of, training
 
 from jaxpend import JaxpendError, Policy, load_policy, sac, snes
 from jaxpend.checkpoint import Checkpoints
-from jaxpend.config import SACConfig, SACRun, SNESConfig
+from jaxpend.config import EnvConfig, SACConfig, SACRun, SNESConfig
 from jaxpend.interrupt import Stopped
+from jaxpend.observation import Observation
 from jaxpend.stages import SAC, SNES
 from jaxpend.train import all_finite, train
 
@@ -84,6 +85,7 @@ def test_a_run_killed_again_and_again_ends_as_one_that_never_was(whole_run):
 SMALL = SACConfig(
     steps=96, eval_every=32, num_envs=8, batch_size=32, replay_capacity=128, warmup_steps=32,
     critic_hidden=(8,), actor_hidden=(8,),
+    env=EnvConfig(observation=Observation(history=2), randomised=0.5),
 )  # fmt: skip
 
 

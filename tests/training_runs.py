@@ -14,6 +14,7 @@ RECIPE = Path(__file__).parents[1] / "experiments" / "pendubot.yaml"
 OPTIONS = f"""
     --config {RECIPE} --seed 3 --run run --sac.steps 1024 --sac.eval-every 32 --sac.num-envs 8
     --sac.batch-size 32 --sac.replay-capacity 128 --sac.critic-hidden 8 --sac.actor-hidden 8
+    --sac.env.observation.history 2 --sac.env.randomised 0.5
     --sac.demonstrations.episodes 2 --sac.demonstrations.duration 1
     --sac.demonstrations.updates 20_000 --sac.demonstrations.batch-size 32
     --snes.generations 12 --snes.population 4 --snes.chunk 1
