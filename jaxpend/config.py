@@ -29,6 +29,12 @@ __all__ = [
 ]
 
 ACTIVATIONS = ("relu", "tanh", "silu")
+STRATEGIES = {  # and what evosax calls them
+    "snes": "SNES",
+    "sep_cma_es": "Sep_CMA_ES",
+    "lm_ma_es": "LM_MA_ES",
+    "open_es": "Open_ES",
+}
 
 
 # The paper's heights of the end effector above which the reward asks for balance, m.
@@ -203,7 +209,7 @@ class SNESConfig:
             raise JaxpendError(f"action_noise is {self.action_noise}; it must not be negative")
         if self.scenarios < 0 or not 0 <= self.scenario_weight <= 1:
             raise JaxpendError("scenarios must not be negative, scenario_weight lies in 0 to 1")
-        choose("strategy", self.strategy, ("snes", "sep_cma_es", "lm_ma_es", "open_es"))
+        choose("strategy", self.strategy, STRATEGIES)
         if self.population < 2:
             raise JaxpendError("population is 1; SNES compares at least two individuals")
         if self.strategy == "open_es" and self.population % 2:
@@ -238,13 +244,15 @@ class GradientConfig:
     scenarios: int = 0  # random imperfect scenarios a step
     scenario_duration: float = 4.0  # s
     scenario_weight: float = 0.8  # of them in what is climbed, where there are any
+    validation: int = 256  # scenarios, always the same, on which steps are compared
     memory: float = 1.0  # s, with which their gradient fades back in time; inf: it does not
     chunk: int = 20  # steps per report
 
     def __post_init__(self):
         for name in (
             "learning_rate", "gain_learning_rate", "final_learning_rate", "duration",
-            "clip", "memory", "line_width", "power_width", "scenario_duration", "chunk",
+            "clip", "memory", "line_width", "power_width", "scenario_duration", "validation",
+            "chunk",
         ):  # fmt: skip
             if not getattr(self, name) > 0:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")

@@ -15,6 +15,7 @@ from .controllers.base import Controller
 from .designs import competition
 from .errors import JaxpendError
 from .plant import Plant
+from .randomisation import LONGEST_DELAY, sample
 from .rollout import Trajectory, rollout
 from .scenario import Scenario
 
@@ -25,6 +26,7 @@ __all__ = [
     "V2_OFFICIAL",
     "Criteria",
     "criteria",
+    "imperfect",
     "nominal",
     "nominal_run",
     "official",
@@ -155,6 +157,17 @@ def performance(
     run = rollout(scenario, controller, key, **options)
     plant = scenario.plant if isinstance(scenario, Scenario) else scenario
     return criteria(run.t, run.x, run.u, plant)
+
+
+def imperfect(controller: Controller, plant: Plant, key: jax.Array, count: int) -> Criteria:
+    """Criteria (count,) of official runs on random imperfect scenarios (``randomisation.sample``).
+
+    ``plant`` is the nominal one; ``key`` is consumed.
+    """
+    key_scenarios, key_runs = jax.random.split(key)
+    scenarios = jax.vmap(lambda k: sample(plant, k))(jax.random.split(key_scenarios, count))
+    one = lambda s, k: performance(controller, s, k, delay_slots=LONGEST_DELAY + 1)  # noqa: E731
+    return jax.vmap(one)(scenarios, jax.random.split(key_runs, count))
 
 
 def score_v1(c: Criteria, terms: dict[str, tuple[float, float]] = V1_OFFICIAL) -> jax.Array:

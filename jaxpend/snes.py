@@ -9,35 +9,26 @@ generation meet the same noise: common random numbers make the comparison fair. 
 evosax stand behind the same options.
 """
 
-import dataclasses
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
-from evosax.algorithms import LM_MA_ES, SNES, Open_ES, Sep_CMA_ES
+from evosax import algorithms
 
-from . import designs
+from . import config, designs
 from ._struct import pytree
 from .config import SNESConfig
 from .controllers.base import Controller
 from .controllers.parameters import coordinates
 from .controllers.policy import change_policies
 from .errors import JaxpendError
-from .randomisation import LONGEST_DELAY, sample
-from .score import performance, score_v2
+from .score import imperfect, performance, score_v2
 
-__all__ = ["SNESConfig", "SNESState", "evolve", "fitness", "init", "value"]
+__all__ = ["SNESConfig", "SNESState", "evolve", "fitness", "init"]
 
-STRATEGIES = {
-    "snes": SNES,
-    "sep_cma_es": Sep_CMA_ES,
-    "lm_ma_es": LM_MA_ES,
-    "open_es": Open_ES,
-}
-# Of the scenarios on which candidates are compared: no seed of a run, and no key of the benchmark.
-VALIDATION_SEED = 2**31 - 1
+STRATEGIES = {name: getattr(algorithms, kind) for name, kind in config.STRATEGIES.items()}
 
 
 @pytree
@@ -64,7 +55,7 @@ def fitness(
     if robot is None:
         raise JaxpendError(f"{type(controller).__name__} does not know its robot; name it")
     plant = designs.competition(robot)
-    key_noise, key_scenario, key_run = jax.random.split(key, 3)
+    key_noise, key_scenarios = jax.random.split(key)
     noise = jnp.asarray(config.action_noise, jnp.float32) if config.action_noise else None
     noisy, policies = change_policies(controller, lambda p: p.replace(action_noise=noise))
     draws = policies and config.action_noise
@@ -74,23 +65,10 @@ def fitness(
     score, diverged = score_v2(c).mean(), jnp.sum(~jnp.isfinite(c.velocity_cost))
     if not config.scenarios:
         return score, diverged
-    wrong = jax.vmap(lambda k: sample(plant, k))(jax.random.split(key_scenario, config.scenarios))
-    keys = jax.random.split(key_run, config.scenarios)
-    slots = LONGEST_DELAY + 1
-    c = jax.vmap(lambda s, k: performance(controller, s, k, delay_slots=slots))(wrong, keys)
+    c = imperfect(controller, plant, key_scenarios, config.scenarios)
     weight = config.scenario_weight
     score = (1 - weight) * score + weight * score_v2(c).mean()
     return score, diverged + jnp.sum(~jnp.isfinite(c.velocity_cost))
-
-
-def value(config: SNESConfig, controller: Controller, robot: str | None = None) -> jax.Array:
-    """What candidates are compared by: ``fitness`` without noise, and always on the same scenarios.
-
-    Those are ``config.validation`` in number, and none if the search meets none.
-    """
-    scenarios = config.validation if config.scenarios else 0
-    quiet = dataclasses.replace(config, action_noise=0.0, scenarios=scenarios)
-    return fitness(quiet, controller, jax.random.key(VALIDATION_SEED), robot)[0]
 
 
 class _Search:
@@ -129,7 +107,9 @@ def init(config: SNESConfig, controller: Controller, key: jax.Array) -> SNESStat
     search = _Search(config, controller)
     key, key_init = jax.random.split(key)
     state = search.strategy.init(key_init, search.start, search.params)
-    return SNESState(state, key, search.start, jnp.asarray(-jnp.inf), jnp.zeros((), jnp.int32))
+    state = SNESState(state, key, search.start, jnp.asarray(-jnp.inf), jnp.zeros((), jnp.int32))
+    # Weak types would be strong after the first chunk, and ``evolve`` compiled a second time.
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf)), state)
 
 
 @partial(jax.jit, static_argnames=("config", "generations", "robot"))
@@ -153,6 +133,10 @@ def evolve(
         population, inner = strategy.ask(key_ask, state.strategy, params)
         judge = lambda p: fitness(config, search.rebuild(p), key_noise, robot)  # noqa: E731
         scores, diverged = jax.vmap(judge)(population)
+        if config.strategy == "lm_ma_es":  # evosax weighs what it remembers by place, not by rank
+            order = jnp.argsort(-scores)
+            population, scores = population[order], scores[order]
+            inner = inner.replace(z=inner.z[order])
         # The one place that negates: evosax minimises.
         inner, _ = strategy.tell(key_tell, population, -scores, inner, params)
         inner = inner.replace(std=inner.std * search.decay)

@@ -16,9 +16,35 @@ from .config import GradientConfig, GuardConfig, SACConfig, SNESConfig
 from .controllers.base import Controller
 from .controllers.guard import guard
 from .controllers.parameters import kinds
-from .score import nominal, score_v2
+from .designs import competition
+from .score import imperfect, nominal, score_v2
 
 __all__ = ["SAC", "SNES", "Gradient", "Imitation", "Stage"]
+
+# Of the scenarios on which candidates are compared: no seed of a run, and no key of the benchmark.
+VALIDATION_SEED = 2**31 - 1
+
+
+@partial(jax.jit, static_argnames=("robot", "count"))
+def _validation(controller: Controller, robot: str, count: int) -> jax.Array:
+    """Mean v2 score over random imperfect scenarios, always the same."""
+    key = jax.random.key(VALIDATION_SEED)
+    return score_v2(imperfect(controller, competition(robot), key, count)).mean()
+
+
+def value(
+    config: GradientConfig | SNESConfig, controller: Controller, score: float, robot: str
+) -> float:
+    """What candidates are compared by, given their official score.
+
+    It is the score itself; of a search that meets scenarios its weighted mean with the mean score
+    over ``config.validation`` of them, which stay the same.
+    """
+    if not config.scenarios:
+        return score
+    weight = config.scenario_weight
+    mean = float(_validation(controller, robot, config.validation))
+    return (1 - weight) * score + weight * mean
 
 
 class Stage:
@@ -160,7 +186,7 @@ class SAC(Stage):
 
 
 class Gradient(Stage):
-    """The gradient of the smooth score; judged is where it is."""
+    """The gradient of the smooth score; judged, by ``value``, is where it is."""
 
     name, title, unit, column = "gradient", "gradient", "steps", "step"
 
@@ -198,8 +224,9 @@ class Gradient(Stage):
     def judge(self, state, metrics):
         policy = gradient.current(self.config, state["start"], state["search"])
         score = float(score_v2(nominal(policy, self.robot)))
-        row = {"score": score, "lost": int(state["search"].lost)}
-        return row | {name: values[-1] for name, values in metrics.items()}, [(policy, score)]
+        worth = value(self.config, policy, score, self.robot)
+        row = {"score": score, "value": worth, "lost": int(state["search"].lost)}
+        return row | {name: values[-1] for name, values in metrics.items()}, [(policy, worth)]
 
     def note(self, row):
         return f"smooth score {float(row['smooth_score']):.4f}  score {row['score']:.4f}"
@@ -214,7 +241,7 @@ class Gradient(Stage):
 class SNES(Stage):
     """SNES on the official score from any controller, guarded; its state has that and the search.
 
-    Judged, by ``snes.value``, are the mean controller and the best individual so far; both are
+    Judged, by ``value``, are the mean controller and the best individual so far; both are
     also scored on the nominal plant and, for the metrics, on fresh noise.
     """
 
@@ -232,7 +259,6 @@ class SNES(Stage):
         shapes = jax.eval_shape(lambda p: p, policy)
         self.policy = self.guarded(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes))
         kinds(self.policy, config.searched)
-        self.value = jax.jit(lambda policy: snes.value(config, policy, robot))
         self.fresh_fitness = jax.jit(lambda p, key: snes.fitness(config, p, key, robot)[0])
 
         def evolve_all(policies, searches, count):
@@ -285,12 +311,11 @@ class SNES(Stage):
         found = {"mean": snes.mean_controller, "individual": snes.best_controller}
         for name, policy_of in found.items():
             policy = policy_of(self.config, start, search)
-            value = score = float(score_v2(nominal(policy, self.robot)))
-            if self.config.scenarios:
-                value = float(self.value(policy))
-            row |= {f"{name}_score": score, f"{name}_value": value}
+            score = float(score_v2(nominal(policy, self.robot)))
+            worth = value(self.config, policy, score, self.robot)
+            row |= {f"{name}_score": score, f"{name}_value": worth}
             row[f"{name}_fresh_fitness"] = self.fresh_fitness(policy, key)
-            candidates.append((policy, value))
+            candidates.append((policy, worth))
         return row, candidates
 
     def note(self, row):

@@ -10,8 +10,17 @@ import pytest
 from conftest import assert_close, both_precisions, both_robots, excerpt
 
 from jaxpend import JaxpendError
+from jaxpend.controllers import Zero
 from jaxpend.designs import competition
-from jaxpend.score import V1_DEFAULT, V2_HARDWARE, criteria, score_v1, score_v2, score_v3
+from jaxpend.score import (
+    V1_DEFAULT,
+    V2_HARDWARE,
+    criteria,
+    imperfect,
+    score_v1,
+    score_v2,
+    score_v3,
+)
 
 SCORES = {
     "score_v1_default": lambda c: score_v1(c, V1_DEFAULT),
@@ -110,6 +119,16 @@ def test_more_effort_never_scores_better():
 
 
 @pytest.mark.x64
+def test_imperfect_runs_are_as_random_as_their_key():
+    judged = jax.jit(lambda key: imperfect(Zero(), competition("acrobot"), key, 24).velocity_cost)
+    moving = np.asarray(judged(jax.random.key(0)))
+    # What hangs is moved by pulses and by torque noise alone: one third of 24, give or take.
+    assert 2 < np.sum(moving > 0) < 16
+    assert len(np.unique(moving)) == 1 + np.sum(moving > 0)
+    np.testing.assert_array_equal(judged(jax.random.key(0)), moving)
+    assert np.any(judged(jax.random.key(1)) != moving)
+
+
 def test_a_run_that_is_not_a_number_fails_with_score_zero():
     t, x, u = held_up()
     judged = judge(t, x.at[2000:].set(jnp.nan), u.at[2000:].set(jnp.nan))

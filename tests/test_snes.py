@@ -1,6 +1,7 @@
 """SNES: the sign, the noise that all share, what is searched, and what a lost run counts for."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from conftest import assert_close
 from jaxpend import JaxpendError, Policy, designs, snes
 from jaxpend.controllers import load_nominal, lqr, tvlqr
 from jaxpend.controllers.hybrid import with_lqr
-from jaxpend.score import official, performance, score_v2
+from jaxpend.score import Criteria, official, performance, score_v2
 from jaxpend.snes import SNESConfig
 
 KEY = jax.random.key(0)
@@ -54,7 +55,10 @@ def test_every_strategy_starts_at_the_controller_and_shrinks_as_told(toy_fitness
     state = snes.init(config, start, KEY)
     for centre in (snes.mean_controller, snes.best_controller):
         jax.tree.map(assert_close, centre(config, start, state), start)
+    before = state
     state, metrics = snes.evolve(config, start, state, 4)
+    # Else it would be compiled a second time, for the second chunk.
+    assert jax.tree.map(jax.typeof, state) == jax.tree.map(jax.typeof, before)
     # From 0.02 to a thousandth of it; they adapt sigma as well, and Open-ES is a generation late.
     assert 2e-6 < metrics["sigma"][-1] < 2e-4
 
@@ -68,6 +72,15 @@ def test_the_search_climbs_the_fitness(toy_fitness, strategy):
     found = snes.mean_controller(config, TOY, state)
     assert distance(found) < 0.2 * distance(TOY)
     assert np.mean(np.asarray(found.layers[0][0])) > 0.05
+
+
+def test_lm_ma_es_remembers_where_the_good_ones_were(toy_fitness):
+    config = SNESConfig(population=20, sigma=0.03, strategy="lm_ma_es")
+    begun = snes.init(config, TOY, KEY)
+    state, _ = snes.evolve(config, TOY, begun, 1)
+    moved, memory = state.strategy.mean - begun.strategy.mean, state.strategy.M[0]
+    along = jnp.dot(moved, memory) / jnp.linalg.norm(moved) / jnp.linalg.norm(memory)
+    assert_close(along, 1.0, times=10)
 
 
 def test_best_individual_is_the_one_with_the_best_fitness_so_far(toy_fitness):
@@ -192,6 +205,21 @@ def test_fitness_is_the_mean_over_rollouts_with_noisy_actions(imitation, fit):
     # Lost runs are worth nothing, and each of them is counted.
     score, diverged = fit(config, lost(imitation.policy), KEY)
     assert (float(score), int(diverged)) == (0.0, 2)
+
+
+def test_scenarios_have_their_weight_in_the_fitness(imitation, monkeypatch):
+    perfect = Criteria(*jnp.zeros((9, 5)), success=jnp.arange(5) > 1)  # score 1 in three of five
+
+    def imperfect(controller, plant, key, count):
+        assert controller is imitation.policy
+        assert count == 5
+        return perfect
+
+    monkeypatch.setattr(snes, "imperfect", imperfect)
+    config = dataclasses.replace(QUIET, scenarios=5, scenario_weight=0.25)
+    score, _ = jax.jit(partial(snes.fitness, config, imitation.policy))(KEY)
+    nominal = official(imitation.policy, "pendubot")["score"]
+    np.testing.assert_allclose(score, 0.75 * nominal + 0.25 * 0.6, atol=2e-3)
 
 
 def test_any_controller_has_a_fitness_and_only_policies_have_action_noise(imitation, fit):
