@@ -13,6 +13,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -68,16 +69,21 @@ def robustness(robot: str, policy: Path) -> dict:
     return found
 
 
-def train(recipe: str, robot: str, seed: int, runs: Path) -> dict:
-    """One run of `python -m jaxpend.train`; returns a row of the table."""
-    folder = runs / f"{recipe}-{robot}-{seed}".replace(" ", "-")
+def folder_of(recipe: str, robot: str, seed: int, runs: Path) -> Path:
+    """The run folder of one run."""
+    return runs / f"{recipe}-{robot}-{seed}".replace(" ", "-")
+
+
+def train(recipe: str, robot: str, seed: int, runs: Path, flags: Sequence[str] = ()) -> dict:
+    """One run of `python -m jaxpend.train`, with more flags; returns a row of the table."""
+    folder = folder_of(recipe, robot, seed, runs)
     if not (folder / "result.json").exists():
         # Relative: the command goes into the policy files.
         config = os.path.relpath(HERE / f"{recipe if recipe == 'plain' else robot}.yaml")
         command = [sys.executable, "-m", "jaxpend.train", "--config", config]
         command += ["--robot", robot, "--seed", str(seed)]
         command += ["--runs", str(runs), "--run", folder.name]
-        command += RECIPES[recipe]
+        command += [*RECIPES[recipe], *flags]
         environment = os.environ | {"XLA_FLAGS": THREAD}
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
         if done.returncode:
@@ -99,7 +105,7 @@ def train(recipe: str, robot: str, seed: int, runs: Path) -> dict:
 
 def without(recipe: str, robot: str, seed: int, runs: Path) -> dict:
     """A row for the policy of a run of the shipped recipe with a part of its guard taken away."""
-    folder = runs / f"shipped-{robot}-{seed}"
+    folder = folder_of("shipped", robot, seed, runs)
     path = folder / f"{recipe}.npz".replace(" ", "-")
     save_policy(path, load_policy(folder / "policy.npz").replace(**TAKEN[recipe]))
     judged = official(load_policy(path), robot)

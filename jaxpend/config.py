@@ -344,8 +344,9 @@ class TrainRun(SACRun):
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """How widely to look."""
+    """How widely to look, and with how much torque."""
 
+    torque_limit: float = 6.0  # N m
     starts: int = 24  # random starts for each horizon
     horizons: tuple[float, ...] = (1.2, 1.4, 1.6, 1.8, 2.1)  # s, of the first stage
     horizon: float = 2.6  # s, of the other stages

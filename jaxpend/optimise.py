@@ -154,9 +154,10 @@ def _coarse(plant, robot, search: Search, say):
 def find(robot: str, config: Search = Search(), *, say=lambda line: None):
     """The optimum trajectories found, best official score first: a list of (Nominal, report).
 
-    Needs ``jax.enable_x64``. Raises ``JaxpendError`` for an unknown robot.
+    Needs ``jax.enable_x64``. Raises ``JaxpendError`` for an unknown robot or a torque limit that
+    is not positive.
     """
-    plant, joint = designs.competition(robot), designs.active_joint(robot)
+    plant, joint = designs.competition(robot, config.torque_limit), designs.active_joint(robot)
     goal, labels, coarse = _coarse(plant, robot, config, say)
     best = np.array(_distinct(np.asarray(coarse.cost), config.keep, same=3 * SAME), int)
     goal, coarse = goal[best], jax.tree.map(lambda v: v[best], coarse)

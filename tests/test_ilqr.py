@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from jaxpend import designs, ilqr, swingup
+from jaxpend import JaxpendError, designs, ilqr, optimise, swingup
 from jaxpend.score import criteria, score_v2
 
 
@@ -191,3 +191,19 @@ def test_rejected_iteration_keeps_the_trajectory_and_grows_the_regularisation():
     np.testing.assert_array_equal(after.u, now.u)
     assert after.rejected == 1
     assert after.mu > now.mu
+
+
+def test_the_search_looks_within_its_torque_limit(monkeypatch):
+    searched = []
+
+    def stop(plant, *_):
+        searched.append(plant.torque_limit)
+        raise StopIteration
+
+    monkeypatch.setattr(optimise, "_coarse", stop)
+    for search in (optimise.Search(), optimise.Search(torque_limit=1.5)):
+        with pytest.raises(StopIteration):
+            optimise.find("acrobot", search)
+    np.testing.assert_array_equal(searched, [[0, 6.0], [0, 1.5]])
+    with pytest.raises(JaxpendError, match="torque limit is -1"):
+        optimise.find("acrobot", optimise.Search(torque_limit=-1.0))

@@ -1,0 +1,175 @@
+"""The torque limit: what SAC and SNES reach within 1.5, 3 and 5 N m, and what is possible there.
+
+    python experiments/torque_limits.py
+
+writes torque_limits.json, .md and .png beside this file. The ceiling is the best score of a
+trajectory: of the shipped swing-up where it fits, else of the one that `jaxpend optimise` finds.
+What is already in the folder of runs is kept, so an interrupted study goes on where it was.
+"""
+
+import argparse
+import json
+import os
+import sys
+from functools import partial
+from pathlib import Path
+
+# One thread, as the runs.
+os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+
+import jax
+import numpy as np
+from seeds import ROBOTS, folder_of, train
+
+from jaxpend import designs
+from jaxpend.controllers import load_nominal, tvlqr
+from jaxpend.curves import draw_curves
+from jaxpend.optimise import Search, find
+from jaxpend.plots import PALETTE, save, stack
+from jaxpend.score import official
+
+HERE = Path(__file__).parent
+LIMITS = (1.5, 3.0, 5.0)  # N m
+TITLES = {"plain": "from the reward alone", "shipped": "from demonstrations"}
+
+
+def ceiling(robot: str, limit: float, runs: Path, starts: int) -> dict:
+    """Best score of a swing-up within the limit, followed by TVLQR, and its peak torque, N m."""
+    path = runs / f"ceiling-{robot}.json"
+    if path.exists():
+        return json.loads(path.read_text())
+    with jax.enable_x64(True):
+        nominal = load_nominal(robot)
+        found = f"optimised, {starts} starts a horizon"
+        if np.abs(nominal.u).max() <= limit:
+            found = "shipped"
+            measured = official(tvlqr(designs.competition(robot, limit), nominal), robot)
+        else:
+            say = lambda line: print(f"{robot}, {limit:g} N m: {line}", file=sys.stderr)  # noqa: E731
+            measured = find(robot, Search(torque_limit=limit, starts=starts), say=say)[0][1]
+    result = {"score": measured["score"], "peak": measured["criteria"]["max_tau"], "found": found}
+    path.write_text(json.dumps(result))
+    return result
+
+
+def row_of(recipe: str, robot: str, limit: float, seed: int, runs: Path) -> dict:
+    """The row of a run, trained unless it is there, with its learning curve."""
+    row = train(recipe, robot, seed, runs, ["--sac.env.torque-limit", str(limit)])
+    lines = (folder_of(recipe, robot, seed, runs) / "metrics.jsonl").read_text().splitlines()
+    curve = [r for r in map(json.loads, lines) if r["stage"] == "sac"]
+    steps, best = ([r[name] for r in curve] for name in ("env_steps", "best"))
+    return row | {"torque_limit": limit, "curve": {"env_steps": steps, "best": best}}
+
+
+def table(rows: list[dict], ceilings: dict) -> str:
+    """A Markdown table with a row for each group of seeds, every seed in it."""
+    lines = [
+        "Score after SAC and after SNES, and robustness (median of five benchmark keys), one "
+        "number a seed; the ceiling is that of trajectory optimisation.",
+        "",
+        "| recipe | robot | torque limit | seeds | after SAC | after SNES | robustness | ceiling |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for recipe, robot, limit in dict.fromkeys(
+        (r["recipe"], r["robot"], r["torque_limit"]) for r in rows
+    ):
+        group = of(rows, recipe, robot, limit)
+        numbers = [
+            ", ".join(f"{value:.{digits}f}" for value in values)
+            for values, digits in (
+                ([r["sac"]["score"] for r in group], 3),
+                ([r["snes"]["score"] for r in group], 3),
+                ([r["robustness"]["median"] for r in group], 2),
+            )
+        ]
+        seeds = ", ".join(str(r["seed"]) for r in group)
+        best = ceilings[robot][str(limit)]["score"]
+        cells = [TITLES[recipe], robot, f"{limit:g} N m", seeds, *numbers, f"{best:.4f}"]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def of(rows: list[dict], recipe: str, robot: str, limit: float) -> list[dict]:
+    """The rows of one group of seeds."""
+    return [
+        r for r in rows if (r["recipe"], r["robot"], r["torque_limit"]) == (recipe, robot, limit)
+    ]
+
+
+def draw_finals(axes, robot: str, rows: list[dict], ceilings: dict) -> None:
+    """Scores over the torque limit: a mark a seed, a line through the medians, the ceiling."""
+    limits = sorted({r["torque_limit"] for r in rows})
+    kinds = [
+        ("plain", "sac", "SAC", "two", "o"),
+        ("plain", "snes", "SAC, SNES", "one", "s"),
+        ("shipped", "snes", "with demonstrations", "three", "^"),
+    ]
+    for shift, (recipe, stage, label, colour, marker) in enumerate(kinds):
+        groups = {a: of(rows, recipe, robot, a) for a in limits}
+        medians = []
+        for i, limit in enumerate(limits):
+            scores = [r[stage]["score"] for r in groups[limit]]
+            at = i + 0.14 * (shift - 1)
+            axes.scatter([at] * len(scores), scores, color=PALETTE[colour], marker=marker, s=26)
+            medians += [(at, np.median(scores))] if scores else []
+        if medians:
+            axes.plot(*zip(*medians, strict=True), color=PALETTE[colour], marker=marker,
+                      markersize=0, label=label)  # fmt: skip
+    for i, limit in enumerate(limits):
+        best = ceilings[robot][str(limit)]["score"]
+        label = "ceiling" if i == 0 else None
+        axes.plot([i - 0.3, i + 0.3], [best, best], color=PALETTE["ink"], label=label)
+    axes.set_xticks(range(len(limits)), [f"{limit:g}" for limit in limits])
+    axes.set(xlabel="torque limit [N m]", ylabel="v2 score", ylim=(0, 0.79))
+    axes.set_title(f"{robot}: every seed, and medians")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=4, columnspacing=1.0)
+
+
+def draw(rows: list[dict], ceilings: dict, path: Path) -> None:
+    """For both robots, learning curves of SAC and scores over the torque limit."""
+    draws = []
+    for robot in dict.fromkeys(r["robot"] for r in rows):
+        mine = [r for r in rows if r["robot"] == robot]
+        curves = {
+            f"{limit:g} N m": [
+                (np.array(r["curve"]["env_steps"]), np.array(r["curve"]["best"]))
+                for r in of(mine, "plain", robot, limit)
+            ]
+            for limit in sorted({r["torque_limit"] for r in mine})
+        }
+        labels = {"xlabel": "environment steps of SAC", "ylabel": "best v2 score so far"}
+        draws += [
+            partial(draw_curves, title=robot, curves=curves, **labels),
+            partial(draw_finals, robot=robot, rows=mine, ceilings=ceilings),
+        ]
+    save(stack(draws, columns=2, size=(5.2, 3.6)), path)
+
+
+def main() -> None:
+    """Run what is missing, write the table and draw the picture."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--limits", nargs="+", type=float, default=LIMITS)
+    parser.add_argument("--recipes", nargs="+", default=["plain"], choices=TITLES)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--robots", nargs="+", default=ROBOTS, choices=ROBOTS)
+    parser.add_argument("--starts", type=int, default=24, help="of the search for the ceiling")
+    parser.add_argument("--runs", type=Path, default=Path("runs/torque_limits"))
+    args = parser.parse_args()
+    rows, ceilings = [], {robot: {} for robot in args.robots}
+    for recipe in args.recipes:
+        for robot in args.robots:
+            for limit in args.limits:
+                runs = args.runs / f"{limit:g}"
+                runs.mkdir(parents=True, exist_ok=True)
+                ceilings[robot][str(limit)] = ceiling(robot, limit, runs, args.starts)
+                rows += [row_of(recipe, robot, limit, seed, runs) for seed in args.seeds]
+                # After every group, so that there is something to look at meanwhile.
+                found = {"rows": rows, "ceilings": ceilings}
+                (HERE / "torque_limits.json").write_text(json.dumps(found, indent=1) + "\n")
+                (HERE / "torque_limits.md").write_text(table(rows, ceilings))
+    draw(rows, ceilings, HERE / "torque_limits.png")
+    print(table(rows, ceilings))
+
+
+if __name__ == "__main__":
+    main()
