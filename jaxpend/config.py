@@ -67,6 +67,8 @@ class EnvConfig:
     observation: Observation = dataclasses.field(default_factory=Observation)
     reward: Reward = dataclasses.field(default_factory=Reward)
     max_speed: float = math.inf  # rad/s; SAC truncates an episode beyond it
+    upright_starts: float = 0.0  # share of episodes that start near upright, not hanging
+    upright_spread: float = 0.03  # rad, standard deviation of both angles there; 3/s of velocities
     randomised: float = 0.0  # share of episodes in a random scenario, see ``randomisation``
 
     def __post_init__(self):
@@ -74,11 +76,13 @@ class EnvConfig:
         if self.reward.line is None:
             reward = dataclasses.replace(self.reward, line=LINES[self.robot])
             object.__setattr__(self, "reward", reward)
-        for name in ("torque_limit", "dt", "duration", "max_speed"):
+        for name in ("torque_limit", "dt", "duration", "max_speed", "upright_spread"):
             if not getattr(self, name) > 0:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
-        if not 0 <= self.randomised <= 1:
-            raise JaxpendError(f"randomised is {self.randomised}; it is a share, from 0 to 1")
+        for name in ("upright_starts", "randomised"):
+            if not 0 <= getattr(self, name) <= 1:
+                share = getattr(self, name)
+                raise JaxpendError(f"{name} is {share}; it is a share, from 0 to 1")
 
     @property
     def episode_steps(self) -> int:

@@ -83,11 +83,11 @@ class DoublePendulum(Env):
         return jnp.concatenate([seen, view.of_state(x), now["action"][None]])
 
     def reset(self, rng: jax.Array) -> State:
-        """A new episode, hanging at rest; ``rng`` draws the scenario, if it is a random one."""
-        x, zero = jnp.zeros(4), jnp.zeros(())
+        """A new episode, hanging at rest or near upright; ``rng`` draws which, and the scenario."""
+        x, zero = self._start(rng), jnp.zeros(())
         now = {"x": x, "action": zero}
         if self.config.observation.history:
-            now["past"] = jnp.zeros((self.config.observation.history, 5))
+            now["past"] = jnp.tile(jnp.append(x, zero), (self.config.observation.history, 1))
         if self.config.randomised:
             key_scenario, key_start, key = jax.random.split(rng, 3)
             scenario = sample(self.plant, key_scenario, self.config.randomised)
@@ -96,6 +96,15 @@ class DoublePendulum(Env):
             states, measured = measure(scenario, states, k, x, z)
             now["world"] = World(scenario, states, measured, jnp.zeros(2), k, key)
         return State(now, self.observe(now), zero, zero, {}, {})
+
+    def _start(self, rng: jax.Array) -> jax.Array:
+        share, spread = self.config.upright_starts, self.config.upright_spread
+        if not share:
+            return jnp.zeros(4)
+        # Apart from the keys of the scenario.
+        key_where, key_x = jax.random.split(jax.random.fold_in(rng, 1))
+        off = spread * jnp.array([1.0, 1.0, 3.0, 3.0]) * jax.random.normal(key_x, (4,))
+        return jnp.where(jax.random.bernoulli(key_where, share), off.at[0].add(jnp.pi), 0.0)
 
     def advance(self, x: jax.Array, previous_action: jax.Array, action: jax.Array):
         """Next state (4,) and reward () of holding ``action`` () in [-1, 1] for one period."""

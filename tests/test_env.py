@@ -242,6 +242,28 @@ def test_brax_wrappers_count_truncate_and_reset(wrapped):
         assert_close(state.obs[0], expected)
 
 
+def test_a_share_of_episodes_starts_near_upright_and_only_there():
+    config = EnvConfig(observation=Observation(history=2), upright_starts=0.25, upright_spread=0.05)
+    keys = jax.random.split(jax.random.key(0), 4000)
+    now = jax.vmap(DoublePendulum(config).reset)(keys).pipeline_state
+    up = np.any(now["x"] != 0, axis=1)
+    np.testing.assert_allclose(up.mean(), 0.25, atol=0.03)  # four standard deviations
+    off = np.asarray(now["x"])[up] - [math.pi, 0, 0, 0]
+    np.testing.assert_allclose(off.std(0), [0.05, 0.05, 0.15, 0.15], rtol=0.1)
+    np.testing.assert_allclose(off.mean(0), 0, atol=0.02)
+    # It has been there all along, as one that hangs has.
+    np.testing.assert_array_equal(now["past"][:, 1, :4], now["x"])
+    np.testing.assert_array_equal(now["past"][..., 4], 0)
+    # The scenario that is met does not depend on where the episode starts.
+    worlds = [
+        DoublePendulum(EnvConfig(randomised=1.0, upright_starts=share)).reset(keys[0])
+        for share in (0.0, 1.0)
+    ]
+    scenarios = [jax.tree.leaves(world.pipeline_state["world"].scenario) for world in worlds]
+    jax.tree.map(np.testing.assert_array_equal, *scenarios)
+    assert worlds[0].pipeline_state["x"][0] == 0 != worlds[1].pipeline_state["x"][0]
+
+
 def test_episode_steps():
     assert EnvConfig().episode_steps == 1000
     assert EnvConfig(dt=0.02, duration=5.0).episode_steps == 250
@@ -256,6 +278,8 @@ def test_episode_steps():
         ({"dt": math.nan}, "dt is nan; it must be positive"),
         ({"duration": -1.0}, "duration is -1.0; it must be positive"),
         ({"max_speed": 0.0}, "max_speed is 0.0; it must be positive"),
+        ({"upright_starts": -0.1}, "upright_starts is -0.1; it is a share, from 0 to 1"),
+        ({"upright_spread": 0.0}, "upright_spread is 0.0; it must be positive"),
         ({"randomised": 1.5}, "randomised is 1.5; it is a share, from 0 to 1"),
     ],
 )
