@@ -126,6 +126,7 @@ class SACConfig:
     updates_per_step: int = 4  # gradient updates per vector step (num_envs environment steps)
     batch_size: int = 256
     replay_capacity: int = 600_000  # transitions
+    mirror: bool = False  # half of every batch, by chance: there is no difference left to right
     warmup_steps: int = 5_000  # environment steps with uniform actions before learning
     discount: float = 0.99
     target_rate: float = 0.005  # Polyak averaging of the target critics

@@ -10,6 +10,7 @@ policy does not see it.
 
 import contextlib
 import io
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -168,6 +169,13 @@ class DoublePendulum(Env):
         """Length of the observation."""
         true = self.config.observation.state_size if self.config.randomised else 0
         return self.seen_size + true + 1
+
+    @property
+    def mirrored(self) -> tuple[int, ...]:
+        """The factors (observation_size,), 1 or -1, that mirror an observation."""
+        view = self.config.observation
+        true = replace(view, history=0).mirrored if self.config.randomised else ()
+        return (*view.mirrored, *true, -1)
 
     @property
     def action_size(self) -> int:

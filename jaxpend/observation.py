@@ -32,7 +32,8 @@ def _sincos(x: jax.Array, max_velocity: float) -> jax.Array:
     return jnp.concatenate([jnp.cos(angles), jnp.sin(angles), velocity / max_velocity])
 
 
-KINDS = {"wrapped": (_wrapped, 4), "sincos": (_sincos, 6)}
+# Name -> function, and the sign of each entry when left and right change places.
+KINDS = {"wrapped": (_wrapped, (-1,) * 4), "sincos": (_sincos, (1, 1, -1, -1, -1, -1))}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +63,13 @@ class Observation:
     @property
     def state_size(self) -> int:
         """Length of what is seen of one state."""
-        return KINDS[self.kind][1]
+        return len(KINDS[self.kind][1])
+
+    @property
+    def mirrored(self) -> tuple[int, ...]:
+        """The factors (``size``,), 1 or -1, that make it the observation of the mirrored state."""
+        signs = KINDS[self.kind][1]
+        return signs + (*signs, -1) * self.history
 
     def of_state(self, x: jax.Array) -> jax.Array:
         """What is seen of a state (4,): (``state_size``,)."""

@@ -263,8 +263,19 @@ def sample(config: SACConfig, state: SACState, key: jax.Array) -> jax.Array:
     """Batches of replay rows for one vector step, (updates_per_step, batch_size, columns).
 
     With demonstrations they come first, and there is a last column of wanted actions, which are 0
-    in the other half.
+    in the other half. With ``config.mirror`` every other row is mirrored, by chance.
     """
+    if config.mirror:
+        key, key_mirror = jax.random.split(key)
+        rows = _sample(config, state, key)
+        signs = DoublePendulum(config.env).mirrored
+        signs = jnp.array([*signs, -1, 1, *signs, -1][: rows.shape[-1]], rows.dtype)
+        flip = jax.random.bernoulli(key_mirror, shape=(*rows.shape[:-1], 1))
+        return rows * jnp.where(flip, signs, 1)
+    return _sample(config, state, key)
+
+
+def _sample(config: SACConfig, state: SACState, key: jax.Array) -> jax.Array:
 
     def draw(rows, size, key, count):
         return rows[jax.random.randint(key, (config.updates_per_step, count), 0, size)]

@@ -242,6 +242,28 @@ def test_brax_wrappers_count_truncate_and_reset(wrapped):
         assert_close(state.obs[0], expected)
 
 
+@pytest.mark.parametrize("kind", ["wrapped", "sincos"])
+@pytest.mark.parametrize("randomised", [0.0, 1.0])
+def test_left_and_right_make_no_difference(kind, randomised):
+    view = Observation(kind, history=2)
+    env = DoublePendulum(EnvConfig(observation=view, randomised=randomised))
+    start = jax.eval_shape(env.reset, jax.random.key(0)).pipeline_state
+    rng = np.random.default_rng(0)
+    x, past, measured = rng.uniform(-3, 3, 4), rng.uniform(-1, 1, (2, 5)), rng.uniform(-3, 3, 4)
+
+    def seen(side):
+        now = {"x": side * x, "past": side * past, "action": jnp.asarray(side * 0.4)}
+        if randomised:
+            now["world"] = start["world"].replace(measured=side * measured)
+        return env.observe(now)
+
+    np.testing.assert_allclose(seen(-1), np.array(env.mirrored) * seen(1), atol=1e-6)
+    assert not np.allclose(seen(-1), seen(1))
+    left, right = (env.advance(jnp.array(side * x), side * 0.4, side * 0.7) for side in (-1, 1))
+    np.testing.assert_allclose(left[0], -right[0], rtol=1e-5)
+    np.testing.assert_allclose(left[1], right[1], rtol=1e-5)
+
+
 def test_a_share_of_episodes_starts_near_upright_and_only_there():
     config = EnvConfig(observation=Observation(history=2), upright_starts=0.25, upright_spread=0.05)
     keys = jax.random.split(jax.random.key(0), 4000)

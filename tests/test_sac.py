@@ -301,6 +301,24 @@ def test_batches_come_from_filled_rows_and_half_of_them_from_demonstrations():
     assert not both[:, 32:, ROW].any()
 
 
+def test_mirrored_batches_are_rows_as_they_were_and_what_a_mirror_shows_of_them():
+    config = small(env=EnvConfig(), mirror=True)
+    columns = 2 * 7 + 2
+    row = 1 + jnp.arange(columns + 1.0)  # observation, action, reward, observation, wanted
+    state = sac.init(config, KEY)
+    state = state.replace(
+        replay=sac.Replay(row[None, :columns], jnp.asarray(0), jnp.asarray(1)),
+        demonstrations=sac.Demonstrations(row[None], jnp.asarray(1)),
+    )
+    signs = np.array([1, 1, -1, -1, -1, -1, -1, -1, 1, 1, 1, -1, -1, -1, -1, -1, -1])
+    batches = np.asarray(sac.sample(config, state, KEY))
+    for part, wanted in ((batches[:, :32], columns + 1), (batches[:, 32:], 0)):
+        whole = np.append(row[:-1], wanted)
+        found, counts = np.unique(part.reshape(-1, columns + 1), axis=0, return_counts=True)
+        assert {tuple(f) for f in found} == {tuple(whole), tuple(signs * whole + 0.0)}
+        assert counts.min() > 0.3 * counts.sum()  # 128 draws: four standard deviations
+
+
 def test_nothing_is_learned_during_warmup():
     config = dataclasses.replace(CREDIT, warmup_steps=3 * 16, updates_per_step=1)
     start = sac.init(config, KEY)
