@@ -74,12 +74,6 @@ def _run(scenarios, controller, keys, *, scored, dt, duration, delay_slots):
     return Outcome(x, upright(x), ~jnp.all(jnp.isfinite(x), axis=-1), score)
 
 
-def _options(scenarios: Scenario, scored: bool, dt: float, duration: float) -> dict[str, Any]:
-    """Static arguments of ``_run``; the buffer is as long as the longest delay needs."""
-    longest = 0 if scenarios.delay is None else int(np.max(scenarios.delay))
-    return {"scored": scored, "dt": dt, "duration": duration, "delay_slots": longest + 1}
-
-
 def _lean(scenarios: Scenario) -> Scenario:
     """Without Coulomb friction where no rollout has any: its arctan is a third of a step."""
     if scenarios.plant.coulomb_friction is None or np.any(scenarios.plant.coulomb_friction):
@@ -95,6 +89,25 @@ def _chunks(scenarios: Scenario, keys: jax.Array, size: int) -> Iterator[tuple]:
     for start in range(0, n, size):
         index = np.minimum(np.arange(start, start + size), n - 1)
         yield jax.tree.map(lambda leaf, at=index: leaf[at], (scenarios, keys))
+
+
+def _plan(
+    scenarios: Scenario,
+    key: jax.Array,
+    scored: bool,
+    dt: float,
+    duration: float,
+    chunk: int | None,
+) -> tuple[Iterator[tuple], dict[str, Any]]:
+    """Pieces (scenarios, keys) for ``_run``, and its static arguments."""
+    size = (512 if scored else 4096) if chunk is None else chunk
+    if size < 1:
+        raise JaxpendError(f"chunk is {size}; it must be at least 1")
+    # The buffer is as long as the longest delay needs.
+    longest = 0 if scenarios.delay is None else int(np.max(scenarios.delay))
+    static = {"scored": scored, "dt": dt, "duration": duration, "delay_slots": longest + 1}
+    keys = jax.random.split(key, len(scenarios.plant.mass))
+    return _chunks(_lean(scenarios), keys, size), static
 
 
 def sweep(
@@ -126,32 +139,26 @@ def sweep(
         JaxpendError: values that mean nothing (see ``check_values``), or a chunk below 1.
     """
     check_values(scenarios)
+    pieces, static = _plan(scenarios, key, scored, dt, duration, chunk)
+    outcomes = [_run(piece, controller, keys, **static) for piece, keys in pieces]
     n = len(scenarios.plant.mass)
-    size = (512 if scored else 4096) if chunk is None else chunk
-    if size < 1:
-        raise JaxpendError(f"chunk is {size}; it must be at least 1")
-    options = _options(scenarios, scored, dt, duration)
-    keys = jax.random.split(key, n)
-    pieces = [_run(s, controller, k, **options) for s, k in _chunks(_lean(scenarios), keys, size)]
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:n], *pieces)
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:n], *outcomes)
 
 
 def compile_sweep(
-    scenarios: Scenario,
-    controller: Controller,
-    key: jax.Array,
-    *,
-    scored: bool = False,
-    dt: float = 0.002,
-    duration: float = 10.0,
-    chunk: int | None = None,
+    scenarios: Scenario, controller: Controller, key: jax.Array, **options: Any
 ) -> None:
-    """Compile what ``sweep`` with the same arguments runs, so that it does not have to."""
-    size = (512 if scored else 4096) if chunk is None else chunk
-    keys = jax.random.split(key, len(scenarios.plant.mass))
-    first, its_keys = next(_chunks(_lean(scenarios), keys, size))
-    options = _options(scenarios, scored, dt, duration)
-    _run.lower(first, controller, its_keys, **options).compile()
+    """Compile what ``sweep`` with the same arguments runs; ``options`` are all of its options."""
+    pieces, static = _plan(scenarios, key, **options)
+    first, keys = next(pieces)
+    _run.lower(first, controller, keys, **static).compile()
+
+
+def _varied(scenario, controller, changes, draw_key, run_key, options) -> Outcome:
+    """A sweep over a scenario, or a plant, with changes to it."""
+    scenario = Scenario(scenario) if isinstance(scenario, Plant) else scenario
+    scenarios = vary(scenario, changes, key=draw_key, dt=options.get("dt", 0.002))
+    return sweep(scenarios, controller, run_key, **options)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,13 +195,11 @@ def survey(
     """
     if repetitions < 1:
         raise JaxpendError(f"repetitions is {repetitions}; it must be at least 1")
-    scenario = Scenario(scenario) if isinstance(scenario, Plant) else scenario
     values = {name: np.atleast_1d(np.asarray(v, float)) for name, v in grid.items()}
     points = np.meshgrid(*values.values(), np.arange(repetitions), indexing="ij")[:-1]
     changes = {name: p.ravel() for name, p in zip(values, points, strict=True)}
     draw_key, run_key = jax.random.split(key)
-    scenarios = vary(scenario, changes, key=draw_key, dt=options.get("dt", 0.002))
-    outcome = sweep(scenarios, controller, run_key, **options)
+    outcome = _varied(scenario, controller, changes, draw_key, run_key, options)
     shape = points[0].shape
     over = lambda a, rule: None if a is None else rule(a.reshape(shape), axis=-1)  # noqa: E731
     return Survey(
@@ -231,7 +236,6 @@ def mildest_failure(
         ``failures`` (fraction of the samples), and if there are any ``severity`` in [0, 1] and
         ``values``, else None in their place.
     """
-    scenario = Scenario(scenario) if isinstance(scenario, Plant) else scenario
     place_key, draw_key, run_key = jax.random.split(key, 3)
     fraction = np.asarray(jax.random.uniform(place_key, (samples, len(ranges))), float)
     # Uniform in severity: else almost all samples of many imperfections would be bad in one.
@@ -239,8 +243,8 @@ def mildest_failure(
     ends = np.array(list(ranges.values()), float)
     values = ends[:, 0] + fraction * (ends[:, 1] - ends[:, 0])
     changes = dict(zip(ranges, values.T, strict=True))
-    scenarios = vary(scenario, changes, key=draw_key, dt=options.get("dt", 0.002))
-    failed = np.flatnonzero(~sweep(scenarios, controller, run_key, **options).success)
+    outcome = _varied(scenario, controller, changes, draw_key, run_key, options)
+    failed = np.flatnonzero(~outcome.success)
     if not len(failed):
         return {"failures": 0.0, "severity": None, "values": None}
     worst = failed[np.argmin(fraction[failed].max(axis=1))]

@@ -13,7 +13,7 @@ from ..arrays import read_arrays, write_arrays
 from ..designs import ROBOTS, active_joint
 from ..errors import JaxpendError, choose
 
-__all__ = ["Nominal", "load_nominal", "read_nominal_header", "save_nominal"]
+__all__ = ["Nominal", "load_nominal", "save_nominal"]
 
 FORMAT = 1
 
@@ -69,18 +69,6 @@ def _locate(robot_or_path: str | Path) -> Path:
     return Path(str(resources.files("jaxpend").joinpath(f"trajectories/{robot_or_path}.npz")))
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    header, arrays = read_arrays(path, "trajectory")
-    if header.get("kind") != "swing-up" or header.get("format") != FORMAT:
-        raise JaxpendError(f"{path} is not a swing-up trajectory of format {FORMAT}")
-    return header, arrays
-
-
-def read_nominal_header(robot_or_path: str | Path) -> dict[str, Any]:
-    """The JSON header of a trajectory file. Raises ``JaxpendError`` as ``load_nominal``."""
-    return _read(_locate(robot_or_path))[0]
-
-
 def load_nominal(robot_or_path: str | Path, *, robot: str | None = None) -> Nominal:
     """Load a trajectory file, or by "acrobot" / "pendubot" the one that ships with the package.
 
@@ -90,7 +78,9 @@ def load_nominal(robot_or_path: str | Path, *, robot: str | None = None) -> Nomi
         JaxpendError: no such file, not a trajectory file, or one for the other robot.
     """
     path = _locate(robot_or_path)
-    header, arrays = _read(path)
+    header, arrays = read_arrays(path, "trajectory")
+    if header.get("kind") != "swing-up" or header.get("format") != FORMAT:
+        raise JaxpendError(f"{path} is not a swing-up trajectory of format {FORMAT}")
     try:
         steps = arrays["u"].shape[0]
         shapes = {name: arrays[name].shape for name in ("x", "u", "gain")}
