@@ -11,6 +11,7 @@ from typing import Literal
 
 from .cli import emit_json
 from .config import GradientRun, SACRun, Search, SNESRun, TrainRun
+from .errors import JaxpendError
 from .files import write_atomically
 from .robots import active_joint
 
@@ -157,6 +158,8 @@ def robustness(
         json: write the result as JSON to this file, or "-" for standard output.
     """
     active_joint(robot)
+    if worst < 0:
+        raise JaxpendError(f"worst is {worst}; it must not be negative")
     import jax
 
     from . import designs

@@ -235,7 +235,12 @@ def mildest_failure(
     Returns:
         ``failures`` (fraction of the samples), and if there are any ``severity`` in [0, 1] and
         ``values``, else None in their place.
+
+    Raises:
+        JaxpendError: as ``survey``, or fewer than one sample.
     """
+    if samples < 1:
+        raise JaxpendError(f"samples is {samples}; it must be at least 1")
     place_key, draw_key, run_key = jax.random.split(key, 3)
     fraction = np.asarray(jax.random.uniform(place_key, (samples, len(ranges))), float)
     # Uniform in severity: else almost all samples of many imperfections would be bad in one.
