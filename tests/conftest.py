@@ -4,17 +4,18 @@ Import from here: ``from conftest import assert_close``.
 """
 
 import contextlib
+import json
 import os
 import resource
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 
 import hypothesis
 import jax
 import numpy as np
 import pytest
 
+from jaxpend import JaxpendError
 from jaxpend.plant import Plant
 
 hypothesis.settings.register_profile("jaxpend", deadline=None, max_examples=40, derandomize=True)
@@ -30,8 +31,14 @@ both_precisions = pytest.mark.parametrize(
 both_robots = pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
 
 
+# Most of the suite's time is compilation. XLA's older emitters without LLVM's optimisations take a
+# third of it, and what they compile runs half as fast.
+XLA = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+
+
 def pytest_configure(config):
     os.environ["JAXPEND_CACHE"] = "off"  # every test compiles what it tests
+    os.environ["XLA_FLAGS"] = f"{XLA} {os.environ.get('XLA_FLAGS', '')}"
     config.addinivalue_line("markers", "x64: run with 64-bit types enabled in jax")
 
 
@@ -49,6 +56,26 @@ def assert_close(actual, expected, *, times: float = 1.0, what: str = ""):
     actual = np.asarray(actual)
     tolerance = times * TOLERANCE[str(actual.dtype)]
     np.testing.assert_allclose(actual, expected, rtol=tolerance, atol=tolerance, err_msg=what)
+
+
+@contextlib.contextmanager
+def refused(words: str, start: str = ""):
+    """Inside, something raises a ``JaxpendError``: one sentence with these words."""
+    with pytest.raises(JaxpendError) as error:
+        yield
+    said = str(error.value)
+    assert words in said
+    assert said.startswith(start)
+    assert "\n" not in said
+
+
+def rewrite(path: Path, change):
+    """Let ``change`` have its way with the arrays and the header of a file of a controller."""
+    with np.load(path) as file:
+        arrays = dict(file)
+    header = json.loads(str(arrays["header"]))
+    change(arrays, header)
+    np.savez(path, **arrays | {"header": np.array(json.dumps(header))})
 
 
 @cache
@@ -69,39 +96,14 @@ def limited_file_size(size: int):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-@pytest.fixture(scope="session")
-def whole_run(tmp_path_factory):
-    """The folder of a training run that was never interrupted, and what it said on its errors."""
-    from training_runs import training
+def shipped_network(bias: float = 0.0):
+    """The network of the pendubot's policy that ships, unguarded, with more in its last bias."""
+    from jaxpend import load_policy
+    from jaxpend.controllers.policy import network_in
 
-    with training(tmp_path_factory.mktemp("training") / "whole") as process:
-        out, err = process.communicate()
-    assert (process.returncode, out) == (0, ""), err
-    return Path(process.args[process.args.index("--runs") + 1]) / "run", err
-
-
-@pytest.fixture(scope="session")
-def imitation():
-    """A policy that imitates the pendubot's swing-up, and the imitation that made it."""
-    from jaxpend.demonstrations import DemonstrationConfig, imitate, imitation, swingups
-    from jaxpend.env import DoublePendulum, EnvConfig
-    from jaxpend.networks import Actor, to_policy
-
-    config = DemonstrationConfig(episodes=150, updates=8000, batch_size=512)
-    env = DoublePendulum(EnvConfig("pendubot"))
-    actor = Actor((64, 64), "tanh", env.seen_size)
-    keys = jax.random.split(jax.random.key(0), 3)
-    rows, wanted = swingups(config, env, keys[0], reward_scale=0.1)
-    untrained = actor.init(keys[1], jax.numpy.zeros(env.observation_size))
-    state = imitation(config, untrained, keys[2])
-    obs = rows[:, : env.observation_size]
-    for _ in range(4):
-        state, loss = imitate(config, actor, state, obs, wanted, 2000)
-    params, error = state.params, loss[-100:].mean()
-    return SimpleNamespace(
-        env=env, actor=actor, obs=obs, wanted=wanted, untrained=untrained, params=params,
-        error=error, policy=to_policy(params, actor, env.config),
-    )  # fmt: skip
+    policy = network_in(load_policy("pendubot"))
+    *hidden, (kernel, last) = policy.layers
+    return policy.replace(layers=(*hidden, (kernel, last + bias)))
 
 
 def plant_from(parameters, torque_limit, actuation) -> Plant:

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close
+from conftest import assert_close, refused
 
-from jaxpend import JaxpendError, Policy, designs
+from jaxpend import Policy, designs
 from jaxpend._struct import pytree, static
 from jaxpend.controllers import TVLQR, Nominal, energy_shaping, lqr, pd, riccati
 from jaxpend.controllers.hybrid import with_lqr
@@ -131,7 +131,5 @@ def test_a_class_says_what_is_searched_of_it_and_its_parts():
     ],
 )
 def test_what_cannot_be_searched_is_one_sentence(controller, searched, words):
-    with pytest.raises(JaxpendError) as error:
+    with refused(words):
         kinds(controller, searched)
-    assert words in str(error.value)
-    assert "\n" not in str(error.value)

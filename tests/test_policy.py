@@ -1,13 +1,12 @@
 """Policies: what the network computes, and what a policy file does and does not hold."""
 
 import itertools
-import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, both_robots
+from conftest import assert_close, both_robots, refused, rewrite
 
 from jaxpend import JaxpendError, Policy, load_policy, save_policy
 from jaxpend.controllers.policy import read_header
@@ -142,16 +141,6 @@ def test_file_round_trip(tmp_path, robot, history):
         assert all(value.dtype != object for value in arrays.values())
 
 
-def rewritten(path, change):
-    """A policy file whose arrays and header ``change`` has had its way with."""
-    save_policy(path, random_policy())
-    with np.load(path) as file:
-        arrays = dict(file)
-    header = json.loads(str(arrays["header"]))
-    change(arrays, header)
-    np.savez(path, **arrays | {"header": np.array(json.dumps(header))})
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -169,11 +158,10 @@ def rewritten(path, change):
 )
 def test_damaged_contents_are_one_sentence(tmp_path, change, words):
     path = tmp_path / "policy.npz"
-    rewritten(path, change)
-    with pytest.raises(JaxpendError) as error:
+    save_policy(path, random_policy())
+    rewrite(path, change)
+    with refused(words):
         load_policy(path)
-    assert words in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("kept", [0, 10, 0.5, 0.95])

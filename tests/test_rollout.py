@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, both_robots, excerpt, plant_from
+from conftest import assert_close, both_robots, excerpt, plant_from, refused
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxpend import JaxpendError, Pulses, Scenario, final_state, rollout
+from jaxpend import Pulses, Scenario, final_state, rollout
 from jaxpend._struct import pytree
 from jaxpend.controllers import Feedback, OpenLoop, Zero
 from jaxpend.controllers.base import Memoryless
@@ -362,7 +362,5 @@ def test_open_loop_holds_each_torque_until_the_next_stamp():
     ],
 )
 def test_bad_input_is_one_sentence(call, words):
-    with pytest.raises(JaxpendError) as error:
+    with refused(words):
         call(competition("acrobot"))
-    assert words in str(error.value)
-    assert "\n" not in str(error.value)

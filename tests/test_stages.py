@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import shipped_network
 
 from jaxpend import stages
 from jaxpend.config import GradientConfig, SNESConfig
@@ -32,12 +33,11 @@ def met(monkeypatch):
         (stages.SNES, SNESConfig(population=2, action_noise=0.0)),
     ],
 )
-def test_candidates_are_compared_by_score_and_by_scenarios_that_stay_the_same(
-    imitation, met, kind, config
-):
-    stage = kind(config, imitation.policy, "pendubot")
-    row, candidates = stage.judge(stage.start(0, imitation.policy), {})
-    expected = score = float(score_v2(nominal(imitation.policy, "pendubot")))
+def test_candidates_are_compared_by_score_and_by_scenarios_that_stay_the_same(met, kind, config):
+    policy = shipped_network()
+    stage = kind(config, policy, "pendubot")
+    row, candidates = stage.judge(stage.start(0, policy), {})
+    expected = score = float(score_v2(nominal(policy, "pendubot")))
     if config.scenarios:
         expected = 0.75 * score + 0.25 * 0.75
     assert met == ([8] if config.scenarios else [])

@@ -2,16 +2,20 @@
 
 import dataclasses
 import json
+import shlex
 import shutil
 import signal
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from training_runs import OPTIONS, arrays_of, rows_of
+from conftest import shipped_network
+from training_runs import OPTIONS, arrays_of, result_of, rows_of, training
 
 from jaxpend import Policy, cli, designs, load_policy, save_policy
 from jaxpend.config import GradientConfig, GradientRun, SACRun, SNESConfig, SNESRun, TrainRun
@@ -46,6 +50,15 @@ def run_command(monkeypatch, kind, *arguments):
     except SystemExit as exit_:
         if exit_.code:
             raise
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory):
+    """The folder of a training run that was never interrupted, and what it said on its errors."""
+    with training(tmp_path_factory.mktemp("training") / "whole") as process:
+        out, err = process.communicate()
+    assert (process.returncode, out) == (0, ""), err
+    return Path(process.args[process.args.index("--runs") + 1]) / "run", err
 
 
 def test_a_run_leaves_its_configuration_metrics_policies_and_result(whole_run):
@@ -84,6 +97,66 @@ def test_the_result_is_the_official_score_of_the_policy(whole_run):
         assert len(network_in(kept).layers) == len(network_in(policy).layers) == 2
     kept = load_policy(folder / "snes_best.npz")
     jax.tree.map(np.testing.assert_array_equal, kept, policy)
+
+
+def wait(process, until):
+    """Wait for something that a process does before it ends."""
+    while not until():
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.01)
+
+
+def test_a_run_killed_again_and_again_ends_as_one_that_never_was(whole_run):
+    whole, _ = whole_run
+    runs = whole.parents[1] / "killed"
+    folder, often = runs / "run", ("--checkpoint.every", "0")
+
+    def reached(stage, count, writing=False):
+        def now():
+            tmp = not writing or any((folder / "checkpoints").glob("*tmp*"))
+            return tmp and len(rows_of(folder, stage)) >= count
+
+        return now
+
+    moments = [
+        (reached("imitation", 1, writing=True), signal.SIGKILL),
+        (reached("sac", 4), signal.SIGINT),
+        (reached("sac", 9, writing=True), signal.SIGKILL),
+        (reached("snes", 2), signal.SIGKILL),
+    ]
+    said = []
+    for until, signum in moments:
+        with training(runs, *often) as process:
+            wait(process, until)
+            before = rows_of(folder)
+            process.send_signal(signum)
+            out, err = process.communicate()
+        said.append(err)
+        assert (out, "Traceback" in err) == ("", False)
+        assert not (folder / "result.json").exists()
+        assert rows_of(folder)[: len(before)] == before
+        if signum == signal.SIGKILL:
+            assert process.returncode == -signum
+            continue
+        assert process.returncode == 128 + signum
+        last = err.splitlines()[-1]
+        assert last.startswith("jaxpend train: stopped in S")
+        command = ["jaxpend", "train", *OPTIONS, "--runs", str(runs), *often]
+        assert last.endswith(f"is in {folder}; to go on: {shlex.join(command)}")
+    with training(runs, *often) as process:
+        _, err = process.communicate()
+    said.append(err)
+    assert process.returncode == 0, err
+    for text, stage in zip(said[2:], ["SAC", "SAC", "SNES"], strict=True):
+        assert f"resuming {folder} in {stage} at " in text
+    assert rows_of(folder) == rows_of(whole)
+    assert result_of(folder) == result_of(whole)
+    for name in ("sac_best.npz", "sac_last.npz", "snes_best.npz", "snes_last.npz", "policy.npz"):
+        killed, never = arrays_of(folder / name), arrays_of(whole / name)
+        assert killed.keys() == never.keys()
+        for key in killed:
+            np.testing.assert_array_equal(killed[key], never[key])
+    assert {p.name for p in folder.iterdir()} == {p.name for p in whole.iterdir()}
 
 
 def test_a_finished_run_is_not_trained_again(whole_run, monkeypatch, capsys):
@@ -133,9 +206,9 @@ def test_snes_starts_from_a_policy_file(whole_run, monkeypatch, tmp_path):
     assert {"policy.npz", "snes_best.npz", "snes_last.npz"} <= names
 
 
-def test_the_gradient_starts_from_a_policy_file(imitation, monkeypatch, tmp_path):
+def test_the_gradient_starts_from_a_policy_file(monkeypatch, tmp_path):
     start, folder = tmp_path / "start.npz", tmp_path / "fine"
-    save_policy(start, imitation.policy)
+    save_policy(start, shipped_network(bias=0.05))
     options = ["--gradient.steps", "5", "--gradient.chunk", "3", "--gradient.learning-rate", "3e-5"]
     options += ["--policy", start, "--runs", tmp_path, "--run", "fine"]
     run_command(monkeypatch, GradientRun, *options)
