@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxpend import cli, designs
 from jaxpend.controllers import energy_shaping, guard, load_nominal, tvlqr
-from jaxpend.controllers.guard import REGION
+from jaxpend.controllers.guard import REGION, SURPLUS
 from jaxpend.controllers.hybrid import with_lqr
 from jaxpend.files import write_atomically
 from jaxpend.randomisation import LONGEST_DELAY, sample
@@ -28,6 +28,7 @@ KINDS = ("model", "delay", "pulses")
 def variants(robot: str) -> dict[str, dict]:
     """Name -> what differs from the guard as it is."""
     fraction, hysteresis = REGION[robot].values()
+    surplus = SURPLUS[robot] or 0.0
     return {
         "as it is": {},
         "no guard": {"bandwidth": 0.0, "rescue": False},
@@ -35,10 +36,15 @@ def variants(robot: str) -> dict[str, dict]:
         "rescue alone": {"bandwidth": 0.0},
         "bandwidth 200 rad/s": {"bandwidth": 200.0},
         "bandwidth 500 rad/s": {"bandwidth": 500.0},
-        "after 1.4 s": {"after": 1.4},
-        "after 2 s": {"after": 2.0},
-        "radius 0.4 rad": {"radius": 0.4},
-        "radius 0.9 rad": {"radius": 0.9},
+        "energy not looked at": {"excess": np.inf},
+        "excess 0.3 J": {"excess": 0.3},
+        "excess 1.2 J": {"excess": 1.2},
+        "surplus - 0.7 J": {"surplus": surplus - 0.7},
+        "surplus + 0.7 J": {"surplus": surplus + 0.7},
+        "after 1.6 s": {"after": 1.6},
+        "after 2.4 s": {"after": 2.4},
+        "radius 0.2 rad": {"radius": 0.2},
+        "radius 0.6 rad": {"radius": 0.6},
         "fraction / 1.5": {"fraction": fraction / 1.5},
         "fraction x 1.5": {"fraction": fraction * 1.5},
         "hysteresis / 1.5": {"hysteresis": max(hysteresis / 1.5, 1.0)},
@@ -48,12 +54,14 @@ def variants(robot: str) -> dict[str, dict]:
 
 def build(main, robot: str, changes: dict):
     """``main`` guarded, with the changes of a variant."""
-    options = {k: v for k, v in changes.items() if k not in REGION[robot]}
+    rescue = REGION[robot] | {"surplus": SURPLUS[robot]}
+    options = {k: v for k, v in changes.items() if k not in rescue}
     guarded = guard(main, robot, **options)
     if len(options) == len(changes):
         return guarded
-    plant, region = designs.competition(robot), REGION[robot] | changes
-    other = with_lqr(energy_shaping(plant, robot), plant, robot, **region)
+    plant, region = designs.competition(robot), rescue | changes
+    pumping = energy_shaping(plant, robot, surplus=region.pop("surplus"))
+    other = with_lqr(pumping, plant, robot, **region)
     return guarded.replace(rescue=guarded.rescue.replace(controller=other))
 
 

@@ -176,13 +176,14 @@ class GuardConfig:
 
     bandwidth: float = 0.0  # rad/s, of the observer of the state from angles; 0: none
     rescue: bool = False  # energy shaping and LQR take over a swing-up that failed
-    after: float = 1.6  # s, the time that a swing-up may take
-    radius: float = 0.6  # rad, of either angle around upright; beyond it a swing-up has failed
+    after: float = 2.0  # s, the time that a swing-up may take
+    radius: float = 0.3  # rad, of either angle around upright; beyond it a swing-up has failed
+    excess: float = 0.6  # J more than at upright, with which it has failed at any time
 
     def __post_init__(self):
         if self.bandwidth < 0:
             raise JaxpendError(f"bandwidth is {self.bandwidth} rad/s; it must not be negative")
-        for name in ("after", "radius"):
+        for name in ("after", "radius", "excess"):
             if not getattr(self, name) > 0:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
 

@@ -26,6 +26,7 @@ from jaxpend.controllers import (
     tracking_mpc,
     tvlqr,
 )
+from jaxpend.controllers.energy import PERIOD
 from jaxpend.controllers.known import KNOWN, build
 from jaxpend.plant import dynamics, rk4_step, total_energy
 from jaxpend.score import official
@@ -217,6 +218,12 @@ def test_energy_shaping_linearises_the_driven_joint_and_pumps(robot):
     error = [0.4 - np.pi, -0.3][a]
     wanted = -20 * error - 5 * x[2 + a] + missing * (0.3 * 1.2 + 0.2 * 2.0 + 0.1)
     np.testing.assert_allclose(dynamics(plant, x, u)[2 + a], wanted, rtol=1e-9)
+    # The surplus goes up and down: nothing at t = 0, all of it (2 J) half a period later.
+    more = energy_shaping(plant, robot, gains=(20.0, 5.0, 0.3, -0.2, 1e9, 0.1), surplus=2.0)
+    for t, surplus in ((0.0, 0.0), (PERIOD / 4, 1.0), (PERIOD / 2, 2.0), (PERIOD, 0.0)):
+        _, u = more(None, t, x)
+        pumped = wanted + surplus * (0.3 * 1.2 + 0.2 * 2.0 + 0.1)
+        np.testing.assert_allclose(dynamics(plant, x, u)[2 + a], pumped, rtol=1e-9)
     result = official(build("energy_lqr", designs.competition(robot), robot), robot)
     assert result["success"]
     assert result["score"] > 0.35

@@ -9,7 +9,7 @@ from conftest import assert_close, both_precisions, both_robots
 from jaxpend import JaxpendError, Scenario, designs, rollout
 from jaxpend.controllers import Feedback, Zero, guard, load_nominal, tvlqr
 from jaxpend.controllers.guard import Guarded, Rescue, observer
-from jaxpend.plant import rk4_step
+from jaxpend.plant import mass_matrix, rk4_step
 from jaxpend.robustness import strips
 from jaxpend.scenario import delay_steps
 from jaxpend.sweep import upright
@@ -126,6 +126,28 @@ def test_rescue_takes_over_for_good():
     assert torques == [1, 1, 2, 2]
 
 
+@pytest.mark.x64
+def test_too_much_energy_is_a_failure_at_any_time():
+    plant = designs.competition("acrobot")
+    upright = jnp.array([jnp.pi, 0.0, 0.0, 0.0])
+    rescue = guard(Zero(), "acrobot", excess=0.5).rescue
+    inertia = np.asarray(mass_matrix(plant, upright))[1, 1]
+    for energy, failed in ((0.49, False), (0.51, True)):
+        spinning = upright.at[3].set(np.sqrt(2 * energy / inertia))
+        assert rescue.failed(jnp.array(0.1), spinning) == failed
+    # A guard of a file that knows no such limit.
+    assert not rescue.replace(excess=None, plant=None).failed(jnp.array(0.1), spinning)
+
+
+def test_what_spins_is_stopped_before_it_is_too_fast():
+    """A driven joint that pushes by itself: TVLQR misses the top and spins it up."""
+    plant = designs.competition("pendubot")
+    pushing = Scenario(plant.replace(damping=np.array([-0.086, 0.0])))
+    main = tvlqr(plant, load_nominal("pendubot"), r=10.0)
+    assert upright(run(pushing, guard(main, "pendubot"), KEY).x[-1])
+    assert not upright(run(pushing, guard(main, "pendubot", excess=np.inf), KEY).x[-1])
+
+
 def test_velocity_noise_and_delay_do_not_reach_a_guarded_controller():
     """The worst velocity noise of the benchmark, under which the bare controller fails."""
     robot, plant = "acrobot", designs.competition("acrobot")
@@ -169,7 +191,7 @@ def test_a_model_is_one_integration_step_ahead():
 def test_nonsense_is_refused_and_nothing_is_added_for_nothing():
     plant, main = designs.competition("acrobot"), Zero()
     assert guard(main, "acrobot", bandwidth=0.0, rescue=False) is main
-    for wrong in ({"after": 0.0}, {"radius": -1.0}, {"bandwidth": -1.0}):
+    for wrong in ({"after": 0.0}, {"radius": -1.0}, {"excess": 0.0}, {"bandwidth": -1.0}):
         with pytest.raises(JaxpendError, match="must be positive"):
             guard(main, "acrobot", **wrong)
     with pytest.raises(JaxpendError, match="must be positive"):

@@ -10,7 +10,9 @@ and ``v`` holds the joint near its upright angle while it feeds energy (J) into 
 
 Source: Spong, "The swing up control problem for the acrobot", 1995, and Fantoni, Lozano, Spong,
 "Energy based control of the pendubot", 2000. It circles through the top; a ``Hybrid`` with LQR
-catches it there.
+catches it there. On a plant that is heavier than the model, or has friction, it falls short of
+the top for ever; with a ``surplus``, E* rises and falls in time, so that it comes by the top
+with the right energy whatever that is.
 """
 
 from typing import ClassVar
@@ -33,13 +35,14 @@ GAINS = {
     "acrobot": (15.7, 4.3, -15.2, 0.72, 195.0, 0.3),
     "pendubot": (22.0, 6.0, 7.9, -0.16, 34.0, 0.3),
 }
+PERIOD = 1.5  # s, in which the surplus goes up and down once: about that of two swings
 
 
 @pytree
 class EnergyShaping(Memoryless):
     """Pumps the total energy to that of upright; needs the plant, as a model."""
 
-    SEARCHED: ClassVar = dict.fromkeys(("kp", "kd", "ke", "cap", "kick"), FACTOR)
+    SEARCHED: ClassVar = dict.fromkeys(("kp", "kd", "ke", "cap", "kick", "surplus"), FACTOR)
     plant: Plant
     kp: jax.Array  # () 1/s^2
     kd: jax.Array  # () 1/s
@@ -47,12 +50,17 @@ class EnergyShaping(Memoryless):
     cap: jax.Array  # () 1/s^2, largest acceleration that the pumping may ask for
     kick: jax.Array  # () 1/(J s^2), starts the motion at the bottom, where omega gives no sign
     joint: int = static()
+    surplus: jax.Array | None = None  # () J, added to E* at most; None: nothing
 
     def __call__(self, carry, t, x):
         """Torque (2,), N m, zero on the passive joint."""
         plant, a = self.plant, self.joint
         upright = jnp.array([jnp.pi, 0.0, 0.0, 0.0], x.dtype)
-        missing = total_energy(plant, upright) - total_energy(plant, x)
+        wanted_energy = total_energy(plant, upright)
+        if self.surplus is not None:
+            triangle = 1 - jnp.abs(2 * jnp.mod(t / PERIOD, 1) - 1)
+            wanted_energy = wanted_energy + self.surplus * triangle
+        missing = wanted_energy - total_energy(plant, x)
         error = deviation(x, upright)
         wanted = (
             -self.kp * error[a]
@@ -68,14 +76,19 @@ class EnergyShaping(Memoryless):
 
 
 def energy_shaping(
-    plant: Plant, robot: str, gains: tuple[float, ...] | None = None
+    plant: Plant,
+    robot: str,
+    gains: tuple[float, ...] | None = None,
+    *,
+    surplus: float | None = None,
 ) -> EnergyShaping:
     """Energy shaping for ``robot``; ``gains`` (kp, kd, ke1, ke2, cap, kick), default tuned ones.
 
-    Raises ``JaxpendError`` for an unknown robot.
+    ``surplus`` (J) is as in ``EnergyShaping``. Raises ``JaxpendError`` for an unknown robot.
     """
     joint = active_joint(robot)
     kp, kd, ke1, ke2, cap, kick = jnp.asarray(
         GAINS[robot] if gains is None else gains, plant.mass.dtype
     )
-    return EnergyShaping(plant, kp, kd, jnp.stack([ke1, ke2]), cap, kick, joint=joint)
+    more = None if surplus is None else jnp.asarray(surplus, plant.mass.dtype)
+    return EnergyShaping(plant, kp, kd, jnp.stack([ke1, ke2]), cap, kick, joint, more)

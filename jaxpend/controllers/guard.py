@@ -11,7 +11,9 @@ does not explain. All three poles of the linear error lie at the bandwidth. On t
 the estimate is exact but for rounding.
 
 A swing-up that has failed is left to a rescue: a controller for which time does not matter, such
-as energy shaping with LQR at the top. It takes over for good.
+as energy shaping with LQR at the top. It takes over for good: when the top is not reached in
+time, and at once when there is more energy than a swing-up needs, for a motor that goes on
+pushing then spins the arm faster than it can be stopped.
 """
 
 from typing import Any, ClassVar
@@ -23,7 +25,7 @@ import numpy as np
 from .._struct import pytree, static
 from ..designs import competition
 from ..errors import JaxpendError
-from ..plant import Plant, rk4_step
+from ..plant import Plant, rk4_step, total_energy
 from .base import Controller
 from .energy import energy_shaping
 from .hybrid import with_lqr
@@ -33,11 +35,14 @@ from .parameters import FACTOR
 __all__ = ["Guarded", "Observer", "Rescue", "guard", "observer"]
 
 # How far LQR is trusted when it ends a rescue: ``fraction`` and ``hysteresis`` of its ellipsoid.
-# Chosen on random scenarios by experiments/guard.py.
+# Chosen on random scenarios by experiments/guard.py, as is all below.
 REGION = {
     "acrobot": {"fraction": 3.0, "hysteresis": 4.0},
     "pendubot": {"fraction": 2.0, "hysteresis": 1.5},
 }
+# J, of the energy that a rescue aims at (``EnergyShaping``), for a plant that is heavier than the
+# model or has friction; the acrobot is better off without.
+SURPLUS = {"acrobot": None, "pendubot": 0.7}
 
 
 @pytree
@@ -89,15 +94,22 @@ def observer(plant: Plant, bandwidth: float, *, dt: float = 0.002) -> Observer:
 class Rescue:
     """When the main controller counts as failed, and who takes over."""
 
-    SEARCHED: ClassVar = {"after": FACTOR, "radius": FACTOR}
+    SEARCHED: ClassVar = {"after": FACTOR, "radius": FACTOR, "excess": FACTOR}
     controller: Any
     after: jax.Array  # () s, before that it is still swinging up
     radius: jax.Array  # () rad, of either angle around upright
+    excess: jax.Array | None = None  # () J, more energy than at upright; None: not looked at
+    plant: Plant | None = None  # the model, for the energy
 
     def failed(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """Whether a state (4,) at time t is one that a swing-up that worked does not reach."""
-        error = deviation(x, jnp.array([jnp.pi, 0.0, 0.0, 0.0], x.dtype))
-        return (t > self.after) & (jnp.max(jnp.abs(error[:2])) > self.radius)
+        upright = jnp.array([jnp.pi, 0.0, 0.0, 0.0], x.dtype)
+        away = jnp.max(jnp.abs(deviation(x, upright)[:2])) > self.radius
+        failed = (t > self.after) & away
+        if self.excess is None:
+            return failed
+        surplus = total_energy(self.plant, x) - total_energy(self.plant, upright)
+        return failed | (surplus > self.excess)
 
 
 @pytree
@@ -136,33 +148,41 @@ class Guarded:
 def guard(
     main: Controller,
     robot: str,
+    plant: Plant | None = None,
     *,
     bandwidth: float = 800.0,
     rescue: bool = True,
-    after: float = 1.6,
-    radius: float = 0.6,
+    after: float = 2.0,
+    radius: float = 0.3,
+    excess: float = 0.6,
 ) -> Controller:
-    """A controller guarded with the competition's plant (``designs.competition``) as the model.
+    """A controller guarded by a model of the plant.
 
     Args:
         main: the controller; without observer and rescue it is returned as it is.
         robot: "acrobot" or "pendubot".
+        plant: the model, concrete arrays; None: the competition's, ``designs.competition``.
         bandwidth: rad/s, of the observer; 0 leaves it out. Less where angles are noisy.
         rescue: whether energy shaping and LQR take over a swing-up that failed.
         after: s, the time that a swing-up may take.
         radius: rad, of either angle around upright; beyond it a swing-up has failed.
+        excess: J; with more than that above the energy of upright it has failed at any time.
 
     Raises:
         JaxpendError: an unknown robot, or a value out of range.
     """
-    plant = jax.tree.map(jnp.asarray, competition(robot))
-    if not (after > 0 and radius > 0):
-        raise JaxpendError(f"after = {after} s and radius = {radius} rad must be positive")
+    plant = jax.tree.map(jnp.asarray, competition(robot) if plant is None else plant)
+    if not (after > 0 and radius > 0 and excess > 0):
+        raise JaxpendError(
+            f"after = {after} s, radius = {radius} rad and excess = {excess} J must be positive"
+        )
     seeing = observer(plant, bandwidth) if bandwidth else None
     rescuing = None
     if rescue:
-        swingup = with_lqr(energy_shaping(plant, robot), plant, robot, **REGION[robot])
-        rescuing = Rescue(swingup, jnp.asarray(after), jnp.asarray(radius))
+        pumping = energy_shaping(plant, robot, surplus=SURPLUS[robot])
+        swingup = with_lqr(pumping, plant, robot, **REGION[robot])
+        limits = map(jnp.asarray, (after, radius, excess))
+        rescuing = Rescue(swingup, *limits, plant)
     if seeing is None and rescuing is None:
         return main
     return Guarded(main, seeing, rescuing)

@@ -53,7 +53,8 @@ KNOWN: dict[str, Known] = {
     ),
     "tvlqr": Known("TVLQR", lambda plant, robot: tvlqr(plant, load_nominal(robot))),
     "tvlqr_guarded": Known(
-        "TVLQR, guarded", lambda plant, robot: guard(tvlqr(plant, load_nominal(robot)), robot)
+        "TVLQR, guarded",
+        lambda plant, robot: guard(tvlqr(plant, load_nominal(robot)), robot, plant),
     ),
     "mpc": Known("iLQR MPC", lambda plant, robot: tracking_mpc(plant, load_nominal(robot))),
     "mpc_free": Known("iLQR MPC, free", free_mpc),
