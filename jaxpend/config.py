@@ -103,14 +103,16 @@ class DemonstrationConfig:
     kicks: float = 0.1  # rad/s, largest standard deviation of velocity jumps between steps
     pulses: float = 0.0  # strength of disturbance pulses; 1 is the robustness benchmark's
     start_spread: float = 0.1  # rad and rad/s, largest standard deviation of the initial state
+    delay: float = 0.0  # s, of measurements, up to which the shown balance would hold
     updates: int = 20_000  # imitation updates of the actor before SAC
     batch_size: int = 1024
     learning_rate: float = 2e-3  # cosine decay to a thousandth
     log_std: float = -2.5  # of the actor that SAC starts with, before the tanh
 
     def __post_init__(self):
-        if self.episodes < 0:
-            raise JaxpendError(f"episodes is {self.episodes}; it must not be negative")
+        for name in ("episodes", "delay"):
+            if not getattr(self, name) >= 0:
+                raise JaxpendError(f"{name} is {getattr(self, name)}; it must not be negative")
         for name in ("duration", "updates", "batch_size", "learning_rate"):
             if not getattr(self, name) > 0:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
@@ -178,7 +180,7 @@ class GuardConfig:
     rescue: bool = False  # energy shaping and LQR take over a swing-up that failed
     after: float = 2.0  # s, the time that a swing-up may take
     radius: float = 0.3  # rad, of either angle around upright; beyond it a swing-up has failed
-    excess: float = 0.6  # J more than at upright, with which it has failed at any time
+    excess: float = 1.2  # J more than at upright, with which it has failed at any time
 
     def __post_init__(self):
         if self.bandwidth < 0:

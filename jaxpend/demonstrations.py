@@ -89,7 +89,7 @@ def swingups(
     """``collect`` with the shipped swing-up of the environment's robot under TVLQR."""
     from .controllers import load_nominal, tvlqr  # loads scipy
 
-    controller = tvlqr(env.plant, load_nominal(env.config.robot), r=10.0)
+    controller = tvlqr(env.plant, load_nominal(env.config.robot), r=10.0, delay=config.delay)
     return collect(config, env, controller, key, reward_scale=reward_scale)
 
 

@@ -15,6 +15,7 @@ from jaxpend.controllers import (
     Hybrid,
     OpenLoop,
     Tolerances,
+    delay_tolerant,
     ellipsoid_of_torque,
     energy_shaping,
     free_mpc,
@@ -91,6 +92,46 @@ def test_lqr_counts_angles_modulo_a_turn_and_respects_the_limit():
     turned = x + 2 * np.pi * np.array([1, -2, 0, 0])
     np.testing.assert_allclose(found(None, 0.0, turned)[1], found(None, 0.0, x)[1], atol=1e-9)
     assert abs(found(None, 0.0, UPRIGHT + np.array([1.0, 0, 0, 0]))[1][0]) == 6.0
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_delay_tolerant_gain_holds_every_delay_up_to_its_own(robot):
+    plant, joint = designs.competition(robot), designs.active_joint(robot)
+    top = lqr(plant, robot, r=10.0)
+    soft = delay_tolerant(top, plant, 0.044)
+    assert not np.asarray(soft.gain[1 - joint]).any()
+    a, b = jacobians(plant, robot, jax.jit(lambda x, u: rk4_step(plant, x, u, 0.002)))
+
+    def rest(gain, delay, steps=3000):
+        """How much of a deviation is left after a while."""
+        past = [np.array([0.01, -0.01, 0.0, 0.0])] * (delay + 1)
+        for _ in range(steps):
+            past = [a @ past[0] - b * (gain[joint] @ past[delay]), *past[:delay]]
+        return np.linalg.norm(past[0])
+
+    gain = np.asarray(soft.gain, float)
+    assert max(rest(gain, delay) for delay in (0, 6, 11, 17, 22)) < 1e-3
+    assert rest(np.asarray(top.gain, float), 22) > 1
+    with pytest.raises(JaxpendError, match=r"no gain was found that tolerates a delay of 0\.1 s"):
+        delay_tolerant(top, plant, 0.1)
+    with pytest.raises(JaxpendError, match=r"delay = -1 s must not be negative"):
+        delay_tolerant(top, plant, -1)
+
+
+def test_tvlqr_that_tolerates_delay_is_soft_once_it_has_arrived():
+    plant, nominal = designs.competition("pendubot"), load_nominal("pendubot")
+    stiff, soft = tvlqr(plant, nominal, r=10.0), tvlqr(plant, nominal, r=10.0, delay=0.044)
+    arrived = soft.nominal.steps
+    off = np.abs(nominal.x - nominal.goal).max(axis=1)
+    assert off[arrived] < 0.1 <= off[:arrived].min()
+    np.testing.assert_array_equal(soft.gain, stiff.gain[:arrived])
+    near = nominal.goal + jnp.array([0.01, 0.02, 0.0, 0.0])
+    early, late = (arrived - 1) * nominal.dt, arrived * nominal.dt
+    np.testing.assert_array_equal(soft(None, early, near)[1], stiff(None, early, near)[1])
+    torque, stiffer = soft(None, late, near)[1][0], stiff(None, late, near)[1][0]
+    np.testing.assert_allclose(torque, -soft.top.gain[0] @ (near - nominal.goal), rtol=1e-4)
+    assert 0 < torque / stiff(None, 3.6, near)[1][0] < 0.7
+    assert torque != stiffer
 
 
 @pytest.mark.parametrize("bad", [{"q": (1, 1, 1)}, {"q": (-1, 1, 1, 1)}, {"r": 0}, {"dt": 0}])

@@ -4,7 +4,7 @@ from .base import Controller, Feedback, OpenLoop, Zero
 from .energy import EnergyShaping, energy_shaping
 from .guard import Guarded, guard
 from .hybrid import Ellipsoid, Hybrid, Tolerances, ellipsoid, ellipsoid_of_torque
-from .lqr import LQR, lqr
+from .lqr import LQR, delay_tolerant, lqr
 from .mpc import MPC, free_mpc, tracking_mpc
 from .nominal import Nominal, load_nominal, save_nominal
 from .pd import PD, pd
@@ -30,6 +30,7 @@ __all__ = [
     "Riccati",
     "Tolerances",
     "Zero",
+    "delay_tolerant",
     "ellipsoid",
     "ellipsoid_of_torque",
     "energy_shaping",

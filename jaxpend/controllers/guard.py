@@ -154,7 +154,7 @@ def guard(
     rescue: bool = True,
     after: float = 2.0,
     radius: float = 0.3,
-    excess: float = 0.6,
+    excess: float = 1.2,
 ) -> Controller:
     """A controller guarded by a model of the plant.
 

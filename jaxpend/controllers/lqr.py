@@ -19,11 +19,14 @@ from ..plant import Plant, linearize
 from .base import Memoryless
 from .parameters import FACTOR
 
-__all__ = ["LQR", "deviation", "lqr"]
+__all__ = ["LQR", "delay_tolerant", "deviation", "lqr"]
 
 # Bryson's rule: 1 / (largest acceptable value)^2 of rad, rad, rad/s, rad/s.
 DEFAULT_Q = (1.0, 1.0, 0.1, 0.1)
 DEFAULT_R = 1.0
+
+
+UPRIGHT = (np.pi, 0.0, 0.0, 0.0)
 
 
 def deviation(x: jax.Array, goal: jax.Array) -> jax.Array:
@@ -55,6 +58,22 @@ class LQR(Memoryless):
         return carry, jnp.clip(torque, -self.torque_limit, self.torque_limit)
 
 
+def _upright(plant: Plant, joint: int) -> tuple[np.ndarray, np.ndarray]:
+    """A (4, 4) and B (4, 1) of the linearisation at upright, float64."""
+    with jax.enable_x64(True):
+        exact = jax.tree.map(lambda v: jnp.asarray(np.asarray(v), jnp.float64), plant)
+        a, b = (np.asarray(m) for m in linearize(exact, jnp.array(UPRIGHT), jnp.zeros(2)))
+    return a, b[:, joint : joint + 1]
+
+
+def _held(a: np.ndarray, b: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """The same for steps of ``dt`` with zero-order hold."""
+    from scipy.linalg import expm
+
+    held = expm(dt * np.block([[a, b], [np.zeros((1, 5))]]))
+    return held[:4, :4], held[:4, 4:]
+
+
 def lqr(
     plant: Plant,
     robot: str,
@@ -75,25 +94,20 @@ def lqr(
     Raises:
         JaxpendError: q, r or dt out of range, or a plant that has no stabilising solution.
     """
-    from scipy.linalg import LinAlgError, expm, solve_continuous_are, solve_discrete_are
+    from scipy.linalg import LinAlgError, solve_continuous_are, solve_discrete_are
 
     joint = active_joint(robot)
     weights = np.asarray(q, float)
     if weights.shape != (4,) or not (weights >= 0).all() or not r > 0 or not (dt is None or dt > 0):
         raise JaxpendError(f"LQR needs q of 4 values >= 0, r > 0 and dt > 0; got {q}, {r}, {dt}")
     dtype = jnp.result_type(plant.mass)
-    with jax.enable_x64(True):
-        exact = jax.tree.map(lambda v: jnp.asarray(np.asarray(v), jnp.float64), plant)
-        goal = jnp.array([jnp.pi, 0.0, 0.0, 0.0])
-        a, b = (np.asarray(m) for m in linearize(exact, goal, jnp.zeros(2)))
-    b = b[:, joint : joint + 1]
+    a, b = _upright(plant, joint)
     try:
         if dt is None:
             p = solve_continuous_are(a, b, np.diag(weights), r * np.eye(1))
             k = b.T @ p / r
         else:
-            held = expm(dt * np.block([[a, b], [np.zeros((1, 5))]]))
-            a, b = held[:4, :4], held[:4, 4:]
+            a, b = _held(a, b, dt)
             p = solve_discrete_are(a, b, dt * np.diag(weights), dt * r * np.eye(1))
             k = b.T @ p @ a / (dt * r + b.T @ p @ b)
     except LinAlgError as error:
@@ -103,6 +117,52 @@ def lqr(
     return LQR(
         gain=jnp.asarray(gain, dtype),
         cost_to_go=jnp.asarray(p, dtype),
-        goal=jnp.asarray(goal, dtype),
+        goal=jnp.asarray(UPRIGHT, dtype),
         torque_limit=jnp.asarray(plant.torque_limit, dtype),
     )
+
+
+def growth(a: np.ndarray, b: np.ndarray, gain: np.ndarray, steps: int) -> float:
+    """How fast the slowest mode of ``u_k = -gain x_(k - steps)`` grows, 1/step; negative: decays.
+
+    ``a`` (4, 4) and ``b`` (4, 1) are of one step, ``gain`` is (4,). The delayed loop is linear in
+    the state and the torques that are on their way.
+    """
+    if not steps:
+        loop = a - b * gain
+    else:
+        loop = np.zeros((4 + steps, 4 + steps))
+        loop[:4, :4], loop[:4, -1], loop[4, :4] = a, b[:, 0], -gain
+        loop[5:, 4:-1] = np.eye(steps - 1)
+    return float(np.log(np.abs(np.linalg.eigvals(loop)).max()))
+
+
+def delay_tolerant(top: LQR, plant: Plant, delay: float, *, dt: float = 0.002) -> LQR:
+    """An LQR with a softer gain, that holds measurements delayed by anything up to ``delay`` (s).
+
+    The gain is the static feedback whose slowest mode decays fastest in the worst of three loops:
+    without delay, with half of it and with all (Nelder-Mead from the LQR's gain, float64). The
+    cost-to-go stays the LQR's, as a measure of how far away a state is.
+
+    Raises:
+        JaxpendError: delay or dt out of range, or no such gain was found.
+    """
+    from scipy.optimize import minimize
+
+    if not (np.isfinite(delay) and delay >= 0 and dt > 0):
+        raise JaxpendError(f"delay = {delay} s must not be negative, dt = {dt} s be positive")
+    start, steps = np.asarray(top.gain, float), round(delay / dt)
+    joint = int(np.abs(start).sum(axis=1).argmax())
+    a, b = _held(*_upright(plant, joint), dt)
+    gain_at = lambda z: start[joint] * (1 + z)  # noqa: E731
+    worst = lambda z: max(growth(a, b, gain_at(z), d) for d in {0, steps // 2, steps})  # noqa: E731
+    z = np.zeros(4)
+    for size in (0.3, 0.3, 0.1, 0.1):  # anew, because its simplex shrinks too early
+        simplex = z + size * np.vstack([np.zeros(4), np.eye(4)])
+        options = {"initial_simplex": simplex, "maxiter": 400}
+        z = minimize(worst, z, method="Nelder-Mead", options=options).x
+    if worst(z) >= 0:
+        raise JaxpendError(f"no gain was found that tolerates a delay of {delay} s")
+    gain = np.zeros((2, 4))
+    gain[joint] = gain_at(z)
+    return top.replace(gain=jnp.asarray(gain, top.gain.dtype))

@@ -16,11 +16,14 @@ import numpy as np
 from .._struct import pytree
 from ..plant import Plant, rk4_step
 from .base import Memoryless
-from .lqr import DEFAULT_Q, DEFAULT_R, LQR, deviation, lqr
+from .lqr import DEFAULT_Q, DEFAULT_R, LQR, delay_tolerant, deviation, lqr
 from .nominal import Nominal
 from .parameters import OVER_TIME
 
 __all__ = ["TVLQR", "along", "tvlqr"]
+
+
+ARRIVED = 0.1  # rad and rad/s, of every component around upright
 
 
 @pytree
@@ -89,6 +92,7 @@ def tvlqr(
     *,
     q: tuple[float, ...] = DEFAULT_Q,
     r: float = DEFAULT_R,
+    delay: float = 0.0,
 ) -> TVLQR:
     """TVLQR along ``nominal``, solved in float64; the result has the dtype of ``nominal``.
 
@@ -97,9 +101,19 @@ def tvlqr(
         nominal: the trajectory.
         q: (4,) diagonal of Q, of the tracking and of the LQR at the end.
         r: 1/(N m)^2.
+        delay: s; if not 0, the gain at the end is ``delay_tolerant``, and takes over as soon as
+            the trajectory has ``ARRIVED``.
 
     Raises:
-        JaxpendError: as ``lqr``.
+        JaxpendError: as ``lqr`` and ``delay_tolerant``.
     """
     gain, _, top = along(plant, nominal, q=q, r=r)
+    if delay:
+        top = delay_tolerant(top, plant, delay, dt=nominal.dt)
+        off = np.abs(np.asarray(nominal.x - nominal.goal)).max(axis=1)
+        steps = min(int(np.argmax(off < ARRIVED)) or nominal.steps, nominal.steps)
+        nominal = nominal.replace(
+            x=nominal.x[: steps + 1], u=nominal.u[:steps], gain=nominal.gain[:steps]
+        )
+        gain = gain[:steps]
     return TVLQR(nominal, gain, top)
