@@ -8,6 +8,7 @@ What is already in the folder of runs is kept, so an interrupted study goes on w
 """
 
 import argparse
+import itertools
 import json
 import os
 import sys
@@ -57,7 +58,8 @@ def row_of(recipe: str, robot: str, limit: float, seed: int, runs: Path) -> dict
     row = train(recipe, robot, seed, runs, ["--sac.env.torque-limit", str(limit)])
     lines = (folder_of(recipe, robot, seed, runs) / "metrics.jsonl").read_text().splitlines()
     curve = [r for r in map(json.loads, lines) if r["stage"] == "sac"]
-    steps, best = ([r[name] for r in curve] for name in ("env_steps", "best"))
+    steps = [r["env_steps"] for r in curve]
+    best = np.maximum.accumulate([r["score"] for r in curve]).round(4).tolist()
     return row | {"torque_limit": limit, "curve": {"env_steps": steps, "best": best}}
 
 
@@ -109,12 +111,16 @@ def draw_finals(axes, robot: str, rows: list[dict], ceilings: dict) -> None:
         medians = []
         for i, limit in enumerate(limits):
             scores = [r[stage]["score"] for r in groups[limit]]
+            if not scores:
+                continue
             at = i + 0.14 * (shift - 1)
-            axes.scatter([at] * len(scores), scores, color=PALETTE[colour], marker=marker, s=26)
-            medians += [(at, np.median(scores))] if scores else []
+            axes.scatter(
+                [at] * len(scores), scores, s=26, color=PALETTE[colour], marker=marker,
+                label=None if medians else label,
+            )  # fmt: skip
+            medians.append((at, np.median(scores)))
         if medians:
-            axes.plot(*zip(*medians, strict=True), color=PALETTE[colour], marker=marker,
-                      markersize=0, label=label)  # fmt: skip
+            axes.plot(*zip(*medians, strict=True), color=PALETTE[colour])
     for i, limit in enumerate(limits):
         best = ceilings[robot][str(limit)]["score"]
         label = "ceiling" if i == 0 else None
@@ -139,7 +145,7 @@ def draw(rows: list[dict], ceilings: dict, path: Path) -> None:
         }
         labels = {"xlabel": "environment steps of SAC", "ylabel": "best v2 score so far"}
         draws += [
-            partial(draw_curves, title=robot, curves=curves, **labels),
+            partial(draw_curves, title=f"{robot}: SAC", curves=curves, **labels),
             partial(draw_finals, robot=robot, rows=mine, ceilings=ceilings),
         ]
     save(stack(draws, columns=2, size=(5.2, 3.6)), path)
@@ -155,19 +161,23 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=24, help="of the search for the ceiling")
     parser.add_argument("--runs", type=Path, default=Path("runs/torque_limits"))
     args = parser.parse_args()
-    rows, ceilings = [], {robot: {} for robot in args.robots}
-    for recipe in args.recipes:
-        for robot in args.robots:
-            for limit in args.limits:
-                runs = args.runs / f"{limit:g}"
-                runs.mkdir(parents=True, exist_ok=True)
-                ceilings[robot][str(limit)] = ceiling(robot, limit, runs, args.starts)
-                rows += [row_of(recipe, robot, limit, seed, runs) for seed in args.seeds]
-                # After every group, so that there is something to look at meanwhile.
-                found = {"rows": rows, "ceilings": ceilings}
-                (HERE / "torque_limits.json").write_text(json.dumps(found, indent=1) + "\n")
-                (HERE / "torque_limits.md").write_text(table(rows, ceilings))
-    draw(rows, ceilings, HERE / "torque_limits.png")
+    folders = {limit: args.runs / f"{limit:g}" for limit in args.limits}
+    for folder in folders.values():
+        folder.mkdir(parents=True, exist_ok=True)
+    ceilings = {
+        robot: {str(a): ceiling(robot, a, folder, args.starts) for a, folder in folders.items()}
+        for robot in args.robots
+    }
+    jobs = itertools.product(args.seeds, args.recipes, args.robots, args.limits)
+    rows = []
+    for seed, recipe, robot, limit in jobs:
+        rows.append(row_of(recipe, robot, limit, seed, folders[limit]))
+        # After every run, so that there is something to look at meanwhile.
+        lines = ",\n".join(map(json.dumps, rows))
+        text = f'{{"ceilings": {json.dumps(ceilings)},\n"rows": [\n{lines}\n]}}\n'
+        (HERE / "torque_limits.json").write_text(text)
+        (HERE / "torque_limits.md").write_text(table(rows, ceilings))
+        draw(rows, ceilings, HERE / "torque_limits.png")
     print(table(rows, ceilings))
 
 
