@@ -54,13 +54,18 @@ def ceiling(robot: str, limit: float, runs: Path, starts: int) -> dict:
 
 
 def row_of(recipe: str, robot: str, limit: float, seed: int, runs: Path) -> dict:
-    """The row of a run, trained unless it is there, with its learning curve."""
+    """The row of a run, trained and judged unless it is there, with its learning curve."""
+    kept = folder_of(recipe, robot, seed, runs) / "row.json"
+    if kept.exists():
+        return json.loads(kept.read_text())
     row = train(recipe, robot, seed, runs, ["--sac.env.torque-limit", str(limit)])
-    lines = (folder_of(recipe, robot, seed, runs) / "metrics.jsonl").read_text().splitlines()
+    lines = kept.with_name("metrics.jsonl").read_text().splitlines()
     curve = [r for r in map(json.loads, lines) if r["stage"] == "sac"]
     steps = [r["env_steps"] for r in curve]
     best = np.maximum.accumulate([r["score"] for r in curve]).round(4).tolist()
-    return row | {"torque_limit": limit, "curve": {"env_steps": steps, "best": best}}
+    row |= {"torque_limit": limit, "curve": {"env_steps": steps, "best": best}}
+    kept.write_text(json.dumps(row))
+    return row
 
 
 def table(rows: list[dict], ceilings: dict) -> str:
