@@ -23,6 +23,7 @@ from jaxpend.rollout import final_state
 from jaxpend.sweep import upright
 
 KINDS = ("model", "delay", "pulses")
+STIFF = "TVLQR ending in LQR, which tolerates less delay"
 
 
 def variants(robot: str) -> dict[str, dict]:
@@ -31,6 +32,7 @@ def variants(robot: str) -> dict[str, dict]:
     surplus = SURPLUS[robot] or 0.0
     return {
         "as it is": {},
+        STIFF: {},
         "no guard": {"bandwidth": 0.0, "rescue": False},
         "observer alone": {"rescue": False},
         "rescue alone": {"bandwidth": 0.0},
@@ -87,7 +89,7 @@ def survives(controller, scenarios, keys):
 
 
 def main(runs: int = 1024, seed: int = 0, out: Path = Path(__file__).parent / "guard.md") -> None:
-    """Judge every variant around TVLQR on the shipped swing-up (r = 10, as demonstrated)."""
+    """Judge every variant around TVLQR on the shipped swing-up, as it is demonstrated."""
     lines = [
         f"Fraction of {runs} random scenarios that end upright (seed {seed}), the main controller",
         "being TVLQR. Standard error about 0.01 (all), 0.02 (a kind); the same scenarios in every",
@@ -97,11 +99,13 @@ def main(runs: int = 1024, seed: int = 0, out: Path = Path(__file__).parent / "g
         plant = designs.competition(robot)
         scenarios, kinds = draw(plant, robot, runs, seed)
         keys = jax.random.split(jax.random.key(seed + 1), len(kinds))
-        controller = tvlqr(plant, load_nominal(robot), r=10.0)
+        demonstrated = tvlqr(plant, load_nominal(robot), r=10.0, delay=0.044)
+        stiff = tvlqr(plant, load_nominal(robot), r=10.0)
         lines += ["", f"## {robot}", "", "| guard | all | " + " | ".join(KINDS) + " |"]
         lines += ["|---|" + "---:|" * (1 + len(KINDS))]
         for name, changes in variants(robot).items():
             print(robot, name, file=sys.stderr)
+            controller = stiff if name == STIFF else demonstrated
             ok = np.asarray(survives(build(controller, robot, changes), scenarios, keys))
             cells = [ok.mean(), *(ok[kinds == i].mean() for i in range(len(KINDS)))]
             lines.append(f"| {name} | " + " | ".join(f"{c:.3f}" for c in cells) + " |")
