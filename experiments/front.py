@@ -24,6 +24,7 @@ STYLE = {
     "published": ("#000000", "D", "published boards"),
     "baseline": ("#0072B2", "o", "classical controllers, here"),
     "ablation": ("#E69F00", "s", "recipe with a part left out or added"),
+    "plain": ("#CC79A7", "^", "SAC and SNES from the reward alone, every seed"),
     "shipped": ("#D55E00", "*", "recipe, every seed"),
 }
 
@@ -39,8 +40,8 @@ def points(robot: str) -> list[tuple[str, str, float, float]]:
     for name in ("seeds", "ablation", "plain"):
         for row in json.loads((HERE / f"{name}.json").read_text()):
             if row["robot"] == robot:
-                kind = "shipped" if row["recipe"] == "shipped" else "ablation"
-                label = "" if kind == "shipped" else row["recipe"]
+                kind = row["recipe"] if row["recipe"] in STYLE else "ablation"
+                label = row["recipe"] if kind == "ablation" else ""
                 found.append((kind, label, row["snes"]["score"], row["robustness"]["median"]))
     return found
 
@@ -68,7 +69,8 @@ def draw(axis, found: list[tuple], labelled: str) -> None:
             axis.annotate(
                 label, (x, y), (-6 if left else 8, -9 if left and crowded else 2),
                 textcoords="offset points", fontsize=8, ha="right" if left else "left",
-                color=colour, annotation_clip=True,
+                color=colour, annotation_clip=True, zorder=2.5,
+                bbox={"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 0.5},
             )  # fmt: skip
     scores = np.array([p[2:] for p in found if p[0] != "published"])
     axis.plot(*scores[front(scores)].T, color="0.6", lw=1.2, zorder=2)
@@ -92,7 +94,7 @@ def main(out: Path = HERE / "front.png") -> None:
     for row in axes:
         row[0].set_ylabel("robustness score (v2)")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
     figure.savefig(out, dpi=110)
 
 
