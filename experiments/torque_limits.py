@@ -165,6 +165,7 @@ def main() -> None:
     parser.add_argument("--robots", nargs="+", default=ROBOTS, choices=ROBOTS)
     parser.add_argument("--starts", type=int, default=24, help="of the search for the ceiling")
     parser.add_argument("--runs", type=Path, default=Path("runs/torque_limits"))
+    parser.add_argument("--finished", action="store_true", help="only runs that are there")
     args = parser.parse_args()
     folders = {limit: args.runs / f"{limit:g}" for limit in args.limits}
     for folder in folders.values():
@@ -176,6 +177,9 @@ def main() -> None:
     jobs = itertools.product(args.seeds, args.recipes, args.robots, args.limits)
     rows = []
     for seed, recipe, robot, limit in jobs:
+        folder = folder_of(recipe, robot, seed, folders[limit])
+        if args.finished and not (folder / "result.json").exists():
+            continue
         rows.append(row_of(recipe, robot, limit, seed, folders[limit]))
         # After every run, so that there is something to look at meanwhile.
         lines = ",\n".join(map(json.dumps, rows))
