@@ -131,7 +131,7 @@ def draw_finals(axes, robot: str, rows: list[dict], ceilings: dict) -> None:
         label = "ceiling" if i == 0 else None
         axes.plot([i - 0.3, i + 0.3], [best, best], color=PALETTE["ink"], label=label)
     axes.set_xticks(range(len(limits)), [f"{limit:g}" for limit in limits])
-    axes.set(xlabel="torque limit [N m]", ylabel="v2 score", ylim=(0, 0.79))
+    axes.set(xlabel="torque limit [N m]", ylabel="v2 score", ylim=(-0.02, 0.79))
     axes.set_title(f"{robot}: every seed, and medians")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=4, columnspacing=1.0)
 
