@@ -276,6 +276,7 @@ def sample(config: SACConfig, state: SACState, key: jax.Array) -> jax.Array:
 
 
 def _sample(config: SACConfig, state: SACState, key: jax.Array) -> jax.Array:
+    """``sample`` without a mirror."""
 
     def draw(rows, size, key, count):
         return rows[jax.random.randint(key, (config.updates_per_step, count), 0, size)]

@@ -277,8 +277,6 @@ class SNES(Stage):
 
     def _begin(self, start, key_init, key_fresh):
         search = snes.init(self.config, start, key_init)
-        # Strong types, as they come out of a chunk: else the second one compiles again.
-        search = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), search)
         return {"start": start, "search": search, "fresh": key_fresh, "done": jnp.asarray(0)}
 
     def like(self):
