@@ -31,7 +31,7 @@ $(STAMP): pyproject.toml .constraints.txt
 install: $(STAMP)  ## make .venv with pinned versions
 
 train: $(STAMP)  ## SAC, then SNES, for ROBOT; ends with the official score
-	$(BIN)/jaxpend train --config experiments/$(ROBOT).yaml --seed $(SEED) --run $(RUN) $(ARGS)
+	$(BIN)/jaxpend train --config $(ROBOT) --seed $(SEED) --run $(RUN) $(ARGS)
 
 snes: $(STAMP)  ## fine-tune by SNES: ARGS='--policy FILE' or '--controller NAME'
 	$(BIN)/jaxpend snes --robot $(ROBOT) --seed $(SEED) $(ARGS)

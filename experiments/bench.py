@@ -11,7 +11,6 @@ The processor's seconds, of all cores together, are what a busy machine does not
 import argparse
 import dataclasses
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +19,11 @@ import numpy as np
 from jaxpend import Scenario, designs, sac, snes
 from jaxpend.config import TrainRun
 from jaxpend.controllers import Policy
-from jaxpend.controllers.known import build
+from jaxpend.controllers.catalogue import build
 from jaxpend.observation import Observation
-from jaxpend.runs import load_config
+from jaxpend.runs.folder import load_config
 from jaxpend.score import performance, score_v2
-from jaxpend.stages import SAC, SNES
+from jaxpend.train.stages import SAC, SNES
 
 
 def random_policy(width: int) -> Policy:
@@ -58,7 +57,7 @@ def show(name: str, times: tuple[float, float, float], speed: str = "") -> None:
 
 def bench_seeds(count: int = 4) -> None:
     """What a vmap over seeds brings, in the recipe of the pendubot."""
-    recipe = load_config(TrainRun(), Path(__file__).parent / "pendubot.yaml")
+    recipe = load_config(TrainRun(), "pendubot")
     # Imitation is not timed: a few demonstrations will do.
     shown = dataclasses.replace(recipe.sac.demonstrations, episodes=20, updates=1)
     config = dataclasses.replace(recipe.sac, demonstrations=shown, eval_every=3200)

@@ -13,9 +13,9 @@ from pathlib import Path
 from jaxpend import designs, leaderboard
 from jaxpend.config import SNESConfig, SNESRun
 from jaxpend.controllers import load_controller
-from jaxpend.controllers.known import KNOWN, build
+from jaxpend.controllers.catalogue import CATALOGUE, build
 from jaxpend.files import write_atomically
-from jaxpend.train import train
+from jaxpend.train.loop import train
 
 HERE = Path(__file__).parent
 BEFORE = -1  # in place of a seed
@@ -76,7 +76,7 @@ def table(rows: list[dict]) -> str:
     for row in rows:
         name, config = CASES[row["case"]]
         searched = config.searched.replace(",", ", ")
-        about = f"| {row['case']} | {KNOWN[name].title} | {searched} | {config.scenarios} "
+        about = f"| {row['case']} | {CATALOGUE[name].title} | {searched} | {config.scenarios} "
         seed, seconds = row["seed"], row.get("seconds")
         seed = "before" if seed == BEFORE else seed
         seconds = "" if seconds is None else f"{seconds:.0f} s"

@@ -14,13 +14,13 @@ import jax
 import numpy as np
 
 from jaxpend import cli, designs
-from jaxpend.controllers import energy_shaping, guard, load_nominal, tvlqr
+from jaxpend.controllers import energy_shaping, guard, load_reference, tvlqr
 from jaxpend.controllers.guard import REGION, SURPLUS
 from jaxpend.controllers.hybrid import with_lqr
 from jaxpend.files import write_atomically
-from jaxpend.randomisation import LONGEST_DELAY, sample
 from jaxpend.rollout import final_state
 from jaxpend.sweep import upright
+from jaxpend.variations import LONGEST_DELAY, sample
 
 KINDS = ("model", "delay", "pulses")
 STIFF = "TVLQR ending in LQR, which tolerates less delay"
@@ -99,8 +99,8 @@ def main(runs: int = 1024, seed: int = 0, out: Path = Path(__file__).parent / "g
         plant = designs.competition(robot)
         scenarios, kinds = draw(plant, robot, runs, seed)
         keys = jax.random.split(jax.random.key(seed + 1), len(kinds))
-        demonstrated = tvlqr(plant, load_nominal(robot), r=10.0, delay=0.044)
-        stiff = tvlqr(plant, load_nominal(robot), r=10.0)
+        demonstrated = tvlqr(plant, load_reference(robot), r=10.0, delay=0.044)
+        stiff = tvlqr(plant, load_reference(robot), r=10.0)
         lines += ["", f"## {robot}", "", "| guard | all | " + " | ".join(KINDS) + " |"]
         lines += ["|---|" + "---:|" * (1 + len(KINDS))]
         for name, changes in variants(robot).items():

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from jaxpend import cli, designs, leaderboard
-from jaxpend.controllers.known import KNOWN, build
+from jaxpend.controllers.catalogue import CATALOGUE, build
 from jaxpend.errors import choose
 from jaxpend.files import write_atomically
 from jaxpend.terminal import console
@@ -28,7 +28,7 @@ def merged(path: Path, robot: str, row: dict) -> dict:
 
 
 def main(
-    controllers: str = ",".join(KNOWN),
+    controllers: str = ",".join(CATALOGUE),
     robots: str = ",".join(designs.ROBOTS),
     keys: int = 3,
     seed: int = 0,
@@ -43,12 +43,12 @@ def main(
         seed: of the first key.
         robustness: False measures performance only.
     """
-    names = [choose("controller", name, KNOWN) for name in controllers.split(",")]
+    names = [choose("controller", name, CATALOGUE) for name in controllers.split(",")]
     path = HERE / "leaderboard.json"
     intro = "# Leaderboards v2: measured by `python experiments/leaderboard.py`, and published\n\n"
     for name in names:
         for robot in (choose("robot", r, designs.ROBOTS) for r in robots.split(",")):
-            title = KNOWN[name].title
+            title = CATALOGUE[name].title
             console.print(f"judging {title} of the {robot} ...")
             row = {"name": name, "title": title, "source": "measured"}
             row |= leaderboard.judge(

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from jaxpend import commands
+from jaxpend.cli import commands
 from jaxpend.files import write_atomically
 
 HERE = Path(__file__).parent / "pictures"

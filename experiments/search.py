@@ -35,12 +35,12 @@ from jaxpend.cli import emit_json
 from jaxpend.config import STRATEGIES, GradientConfig, SACRun, SNESConfig
 from jaxpend.controllers import guard
 from jaxpend.files import write_atomically
-from jaxpend.randomisation import sample
-from jaxpend.runs import load_config
-from jaxpend.stages import SNES, Gradient
+from jaxpend.runs.folder import load_config
 from jaxpend.sweep import sweep
 from jaxpend.terminal import console
-from jaxpend.train import train
+from jaxpend.train.loop import train
+from jaxpend.train.stages import SNES, Gradient
+from jaxpend.variations import sample
 
 HERE = Path(__file__).parent
 SEEDS = (0, 1, 2)
@@ -76,7 +76,7 @@ def start_of(kind: str, robot: str, seed: int, runs: Path):
     if not (folder / "policy.npz").exists():
         config = SACRun(robot=robot, seed=seed, runs=str(runs), run=folder.name)
         if kind != "sac":  # fewer steps than the actor's delay: imitation alone
-            config = load_config(config, HERE / f"{robot}.yaml", also=("snes", "guard"))
+            config = load_config(config, robot, also=("snes", "guard"))
             shown = dataclasses.replace(config.sac.demonstrations, updates=int(kind))
             sac = dataclasses.replace(config.sac, demonstrations=shown, steps=32)
             config = dataclasses.replace(config, sac=sac)

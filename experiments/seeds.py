@@ -79,7 +79,7 @@ def train(recipe: str, robot: str, seed: int, runs: Path, flags: Sequence[str] =
     folder = folder_of(recipe, robot, seed, runs)
     if not (folder / "result.json").exists():
         # Relative: the command goes into the policy files.
-        config = os.path.relpath(HERE / f"{recipe if recipe == 'plain' else robot}.yaml")
+        config = "plain" if recipe == "plain" else robot
         command = [sys.executable, "-m", "jaxpend.train", "--config", config]
         command += ["--robot", robot, "--seed", str(seed)]
         command += ["--runs", str(runs), "--run", folder.name]

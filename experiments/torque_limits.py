@@ -23,11 +23,11 @@ import numpy as np
 from seeds import ROBOTS, folder_of, train
 
 from jaxpend import designs
-from jaxpend.controllers import load_nominal, tvlqr
-from jaxpend.curves import draw_curves
-from jaxpend.optimise import Search, find
-from jaxpend.plots import PALETTE, save, stack
+from jaxpend.controllers import load_reference, tvlqr
+from jaxpend.report.charts import draw_curves
+from jaxpend.report.figures import PALETTE, save, stack
 from jaxpend.score import official
+from jaxpend.trajopt.search import Search, find
 
 HERE = Path(__file__).parent
 LIMITS = (1.5, 3.0, 5.0)  # N m
@@ -40,11 +40,11 @@ def ceiling(robot: str, limit: float, runs: Path, starts: int) -> dict:
     if path.exists():
         return json.loads(path.read_text())
     with jax.enable_x64(True):
-        nominal = load_nominal(robot)
+        reference = load_reference(robot)
         found = f"optimised, {starts} starts a horizon"
-        if np.abs(nominal.u).max() <= limit:
+        if np.abs(reference.u).max() <= limit:
             found = "shipped"
-            measured = official(tvlqr(designs.competition(robot, limit), nominal), robot)
+            measured = official(tvlqr(designs.competition(robot, limit), reference), robot)
         else:
             say = lambda line: print(f"{robot}, {limit:g} N m: {line}", file=sys.stderr)  # noqa: E731
             measured = find(robot, Search(torque_limit=limit, starts=starts), say=say)[0][1]

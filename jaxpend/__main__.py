@@ -1,5 +1,5 @@
 """``python -m jaxpend``: the same as the command ``jaxpend``."""
 
-from .cli import main
+from .cli.app import main
 
 main()

@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 
 from . import designs
-from ._struct import pytree
 from .config import EnvConfig, Reward
 from .plant import forward_kinematics, kinetic_energy, potential_energy, rk4_step
-from .randomisation import LONGEST_DELAY, sample
+from .pytree import pytree
 from .rollout import actuate, draws, measure
 from .scenario import Scenario
+from .variations import LONGEST_DELAY, sample
 
 # MuJoCo, which Brax loads, prints what it lacks to standard output.
 with contextlib.redirect_stdout(io.StringIO()):

@@ -26,16 +26,16 @@ import numpy as np
 import optax
 
 from . import designs
-from ._struct import pytree
 from .config import GradientConfig
-from .controllers.base import Controller
-from .controllers.parameters import coordinates
+from .controller import Controller
+from .controllers.search_space import coordinates
 from .plant import rk4_step
-from .randomisation import LONGEST_DELAY, sample
+from .pytree import pytree
 from .rollout import rollout
 from .scenario import Scenario
 from .sweep import EPSILON
-from .swingup import SwingUp, smooth_score, totals
+from .trajopt.swingup import SwingUp, smooth_score, totals
+from .variations import LONGEST_DELAY, sample
 
 __all__ = ["GradientConfig", "GradientState", "current", "improve", "init", "slope"]
 
@@ -163,6 +163,6 @@ def current(config: GradientConfig, start: Controller, state: GradientState) -> 
 
 
 if __name__ == "__main__":
-    from .cli import main
+    from .cli.app import main
 
     main("gradient")

@@ -14,9 +14,9 @@ import jax
 
 from . import designs
 from .boards import HEADINGS, PUBLISHED
-from .controllers.known import KNOWN, build
+from .controllers.catalogue import CATALOGUE, build
+from .controllers.files import load_controller
 from .controllers.policy import load_policy
-from .controllers.saved import load_controller
 from .errors import JaxpendError, choose
 from .robustness import CRITERIA, benchmark
 from .score import official
@@ -162,12 +162,12 @@ def _ships_policy(robot: str) -> bool:
 def chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[str, tuple]:
     """Name -> (title, make) of what the command line asks for."""
     if controllers is None:
-        names = [n for n in KNOWN if not n.startswith("policy") or _ships_policy(robot)]
+        names = [n for n in CATALOGUE if not n.startswith("policy") or _ships_policy(robot)]
     else:
         names = [name.strip() for name in controllers.split(",") if name.strip()]
     chosen = {
         name: (
-            KNOWN[choose("controller", name, KNOWN)].title,
+            CATALOGUE[choose("controller", name, CATALOGUE)].title,
             lambda plant, name=name: build(name, plant, robot),
         )
         for name in names
@@ -179,6 +179,6 @@ def chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[str
 
 
 if __name__ == "__main__":
-    from .cli import main
+    from .cli.app import main
 
     main("leaderboard")

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._struct import pytree
+from .pytree import pytree
 
 __all__ = [
     "Plant",

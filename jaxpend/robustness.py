@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .controllers.base import Controller
+from .controller import Controller
 from .errors import JaxpendError, choose
 from .plant import Plant
 from .scenario import Pulses, Scenario
@@ -285,6 +285,6 @@ def success_map(controller, plant, names, key, options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    from .cli import main
+    from .cli.app import main
 
     main("robustness")

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._struct import pytree
-from .controllers.base import Controller
+from .controller import Controller
 from .errors import JaxpendError
 from .plant import Plant, rk4_step
+from .pytree import pytree
 from .scenario import Scenario
 
 __all__ = ["Trajectory", "final_state", "rollout", "time_stamps"]

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._struct import pytree
 from .errors import JaxpendError, choose
 from .plant import Plant
+from .pytree import pytree
 
 __all__ = ["Pulses", "Scenario", "check_values", "delay_steps", "random_pulses"]
 

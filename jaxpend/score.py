@@ -10,14 +10,14 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from ._struct import pytree
-from .controllers.base import Controller
+from .controller import Controller
 from .designs import competition
 from .errors import JaxpendError
 from .plant import Plant
-from .randomisation import LONGEST_DELAY, sample
+from .pytree import pytree
 from .rollout import Trajectory, rollout
 from .scenario import Scenario
+from .variations import LONGEST_DELAY, sample
 
 __all__ = [
     "V1_DEFAULT",
@@ -221,6 +221,6 @@ def official(controller: Controller, robot: str) -> dict:
 
 
 if __name__ == "__main__":
-    from .cli import main
+    from .cli.app import main
 
     main("score")

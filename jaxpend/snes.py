@@ -18,12 +18,12 @@ import optax
 from evosax import algorithms
 
 from . import config, designs
-from ._struct import pytree
 from .config import SNESConfig
-from .controllers.base import Controller
-from .controllers.parameters import coordinates
+from .controller import Controller
 from .controllers.policy import change_policies
+from .controllers.search_space import coordinates
 from .errors import JaxpendError
+from .pytree import pytree
 from .score import imperfect, performance, score_v2
 
 __all__ = ["SNESConfig", "SNESState", "evolve", "fitness", "init"]
@@ -166,6 +166,6 @@ def best_controller(config: SNESConfig, start: Controller, state: SNESState) -> 
 
 
 if __name__ == "__main__":
-    from .cli import main
+    from .cli.app import main
 
     main("snes")

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._struct import pytree
-from .controllers.base import Controller
+from .controller import Controller
 from .errors import JaxpendError
 from .plant import Plant
+from .pytree import pytree
 from .rollout import final_state, rollout
 from .scenario import Scenario, check_values
 from .score import criteria, score_v2

@@ -8,7 +8,7 @@ import pytest
 from conftest import limited_file_size
 
 from jaxpend import JaxpendError
-from jaxpend.checkpoint import MANIFEST, Checkpoints
+from jaxpend.runs.checkpoints import MANIFEST, Checkpoints
 
 
 def tree(number):

@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 
 import jaxpend
-from jaxpend import JaxpendError, __version__, cli, commands
+from jaxpend import JaxpendError, __version__, cli
+from jaxpend.cli import app, commands
 from jaxpend.config import TrainRun
-from jaxpend.interrupt import Stopped
+from jaxpend.train.interrupt import Stopped
 
-RECIPE = Path(__file__).parents[1] / "experiments" / "pendubot.yaml"
+RECIPE = "pendubot"
 
 
 @pytest.mark.parametrize(
@@ -210,13 +211,12 @@ def test_help_and_refusals_do_not_wait_for_jax(tmp_path):
 
 @pytest.mark.parametrize("name", cli.COMMANDS)
 def test_help_has_an_example_that_parses(monkeypatch, capsys, name):
-    monkeypatch.chdir(RECIPE.parents[1])
     code, out, err = run(monkeypatch, capsys, f"{name} --help", cli.main)
     example = cli.COMMANDS[name].example
     assert (code, err) == (0, "")
     assert f"example: jaxpend {name} {example}" in " ".join(out.split())
     module, _, function = (cli.COMMANDS[name].function or f"commands:{name}").partition(":")
-    function = getattr(importlib.import_module(f"jaxpend.{module}"), function)
+    function = getattr(importlib.import_module(f"jaxpend.cli.{module}"), function)
     call = cli.parse(function, "prog", example.split())
     assert call.func is function
     assert call.args or call.keywords
@@ -243,18 +243,18 @@ def test_where_compiled_programs_are_kept(monkeypatch, tmp_path):
     for name in ("JAXPEND_CACHE", "JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert cli._cache_folder() == tmp_path / ".cache" / "jaxpend" / "xla"
+    assert app._cache_folder() == tmp_path / ".cache" / "jaxpend" / "xla"
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
-    assert cli._cache_folder() == tmp_path / ".cache" / "jaxpend" / "xla"
+    assert app._cache_folder() == tmp_path / ".cache" / "jaxpend" / "xla"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert cli._cache_folder() == tmp_path / "xdg" / "jaxpend" / "xla"
+    assert app._cache_folder() == tmp_path / "xdg" / "jaxpend" / "xla"
     for off in ("off", "0", "No", "FALSE"):
         monkeypatch.setenv("JAXPEND_CACHE", off)
-        assert cli._cache_folder() is None
+        assert app._cache_folder() is None
     monkeypatch.setenv("JAXPEND_CACHE", "~/mine")
-    assert cli._cache_folder() == tmp_path / "mine"
+    assert app._cache_folder() == tmp_path / "mine"
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "jax")
-    assert cli._cache_folder() is None
+    assert app._cache_folder() is None
 
 
 def score(**environment):

@@ -19,16 +19,16 @@ from jaxpend.controllers import (
     ellipsoid_of_torque,
     energy_shaping,
     free_mpc,
-    load_nominal,
+    load_reference,
     lqr,
     pd,
     riccati,
-    save_nominal,
+    save_reference,
     tracking_mpc,
     tvlqr,
 )
+from jaxpend.controllers.catalogue import CATALOGUE, build
 from jaxpend.controllers.energy import PERIOD
-from jaxpend.controllers.known import KNOWN, build
 from jaxpend.plant import dynamics, rk4_step, total_energy
 from jaxpend.score import official
 
@@ -119,17 +119,17 @@ def test_delay_tolerant_gain_holds_every_delay_up_to_its_own(robot):
 
 
 def test_tvlqr_that_tolerates_delay_is_soft_once_it_has_arrived():
-    plant, nominal = designs.competition("pendubot"), load_nominal("pendubot")
-    stiff, soft = tvlqr(plant, nominal, r=10.0), tvlqr(plant, nominal, r=10.0, delay=0.044)
-    arrived = soft.nominal.steps
-    off = np.abs(nominal.x - nominal.goal).max(axis=1)
+    plant, reference = designs.competition("pendubot"), load_reference("pendubot")
+    stiff, soft = tvlqr(plant, reference, r=10.0), tvlqr(plant, reference, r=10.0, delay=0.044)
+    arrived = soft.reference.steps
+    off = np.abs(reference.x - reference.goal).max(axis=1)
     assert off[arrived] < 0.1 <= off[:arrived].min()
     np.testing.assert_array_equal(soft.gain, stiff.gain[:arrived])
-    near = nominal.goal + jnp.array([0.01, 0.02, 0.0, 0.0])
-    early, late = (arrived - 1) * nominal.dt, arrived * nominal.dt
+    near = reference.goal + jnp.array([0.01, 0.02, 0.0, 0.0])
+    early, late = (arrived - 1) * reference.dt, arrived * reference.dt
     np.testing.assert_array_equal(soft(None, early, near)[1], stiff(None, early, near)[1])
     torque, stiffer = soft(None, late, near)[1][0], stiff(None, late, near)[1][0]
-    np.testing.assert_allclose(torque, -soft.top.gain[0] @ (near - nominal.goal), rtol=1e-4)
+    np.testing.assert_allclose(torque, -soft.top.gain[0] @ (near - reference.goal), rtol=1e-4)
     assert 0 < torque / stiff(None, 3.6, near)[1][0] < 0.7
     assert torque != stiffer
 
@@ -144,23 +144,23 @@ def test_bad_weights_of_lqr_are_one_sentence(bad):
 
 
 @cache
-def nominal(robot):
+def reference(robot):
     with jax.enable_x64(True):
-        return load_nominal(robot)
+        return load_reference(robot)
 
 
 @pytest.mark.parametrize(("robot", "bar"), [("acrobot", 0.714), ("pendubot", 0.700)])
 def test_shipped_swing_ups_reach_their_official_score(robot, bar):
     plant = designs.competition(robot)
     for make in (tvlqr, riccati):
-        result = official(make(plant, nominal(robot)), robot)
+        result = official(make(plant, reference(robot)), robot)
         assert result["success"]
         assert result["score"] >= bar
     assert result["criteria"]["max_tau"] < 3.0
 
 
 def test_shipped_swing_up_obeys_the_equations_of_motion():
-    found = nominal("acrobot")
+    found = reference("acrobot")
     plant = designs.competition("acrobot")
     step = jax.jit(jax.vmap(lambda x, u: rk4_step(plant, x, u, found.dt)))
     torques = found.both(found.u[:, None])
@@ -170,7 +170,7 @@ def test_shipped_swing_up_obeys_the_equations_of_motion():
 
 
 def test_tvlqr_rejects_what_open_loop_does_not_and_vmap_is_a_loop():
-    plant, found = designs.competition("acrobot"), nominal("acrobot")
+    plant, found = designs.competition("acrobot"), reference("acrobot")
     tracking = tvlqr(plant, found)
     playing = OpenLoop(found.dt * (jnp.arange(found.steps) - 0.5), found.both(found.u[:, None]))
     x0 = 0.02 * jnp.array([[1.0, 0, 0, 0], [0, -1.0, 1.0, 0], [0, 0, 0, 2.0]])
@@ -189,7 +189,7 @@ def test_tvlqr_rejects_what_open_loop_does_not_and_vmap_is_a_loop():
 
 def test_tvlqr_gains_are_constant_where_the_trajectory_rests():
     """A trajectory that stays upright has the infinite-horizon gain all along."""
-    rest = nominal("pendubot").replace(
+    rest = reference("pendubot").replace(
         x=jnp.tile(UPRIGHT, (51, 1)), u=jnp.zeros(50), gain=jnp.zeros((50, 5))
     )
     found = tvlqr(designs.competition("pendubot"), rest)
@@ -198,16 +198,16 @@ def test_tvlqr_gains_are_constant_where_the_trajectory_rests():
 
 def test_trajectory_files_round_trip_and_say_what_is_wrong(tmp_path):
     path = tmp_path / "swing.npz"
-    save_nominal(path, nominal("acrobot"), {"score": 0.5})
-    again = load_nominal(path, robot="acrobot")
-    np.testing.assert_array_equal(again.u, nominal("acrobot").u)
+    save_reference(path, reference("acrobot"), {"score": 0.5})
+    again = load_reference(path, robot="acrobot")
+    np.testing.assert_array_equal(again.u, reference("acrobot").u)
     with pytest.raises(JaxpendError, match="for the acrobot, not for the pendubot"):
-        load_nominal(path, robot="pendubot")
+        load_reference(path, robot="pendubot")
     with pytest.raises(JaxpendError, match="there is no trajectory file"):
-        load_nominal(tmp_path / "none.npz")
+        load_reference(tmp_path / "none.npz")
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(JaxpendError, match="not a trajectory file, or it is empty or cut off"):
-        load_nominal(path)
+        load_reference(path)
 
 
 # --- hybrids, PD, energy ---------------------------------------------------------------------
@@ -275,7 +275,7 @@ def test_energy_shaping_linearises_the_driven_joint_and_pumps(robot):
 
 def test_mpc_with_the_tracking_cost_is_tvlqr_to_first_order():
     """Same Q, R, and the cost-to-go at the end of its horizon: the optimum is TVLQR's torque."""
-    plant, found = designs.competition("pendubot"), nominal("pendubot")
+    plant, found = designs.competition("pendubot"), reference("pendubot")
     weights = {"q": (1.0, 1.0, 0.1, 0.1), "r": 10.0}
     mpc = tracking_mpc(plant, found, smoothness=0.0, horizon=12, every=4, iterations=2, **weights)
     tracking = tvlqr(plant, found, **weights)
@@ -310,7 +310,7 @@ def test_mpc_that_is_lost_finds_its_turn_and_holds_the_top():
 
 def test_mpc_rejects_horizons_that_do_not_fit():
     with pytest.raises(JaxpendError, match="1 <= every < horizon"):
-        tracking_mpc(designs.competition("acrobot"), nominal("acrobot"), horizon=5, every=5)
+        tracking_mpc(designs.competition("acrobot"), reference("acrobot"), horizon=5, every=5)
 
 
 # --- all of them -----------------------------------------------------------------------------
@@ -318,7 +318,7 @@ def test_mpc_rejects_horizons_that_do_not_fit():
 
 # A network has a torque limit of its own.
 @pytest.mark.parametrize(
-    "name", [n for n in KNOWN if not n.startswith("policy") and n != "mpc_free"]
+    "name", [n for n in CATALOGUE if not n.startswith("policy") and n != "mpc_free"]
 )
 def test_known_controllers_stay_in_their_box_and_keep_their_type(name):
     """In float32 too, with wild states, and nothing on the passive joint."""

@@ -10,16 +10,10 @@ from conftest import assert_close
 
 from jaxpend import JaxpendError
 from jaxpend.controllers import Feedback, Zero
-from jaxpend.demonstrations import (
-    DemonstrationConfig,
-    collect,
-    imitate,
-    imitation,
-    swingups,
-)
 from jaxpend.env import DoublePendulum, EnvConfig
-from jaxpend.networks import Actor, to_policy
-from jaxpend.sac import SACConfig, init
+from jaxpend.sac.algorithm import SACConfig, init
+from jaxpend.sac.demonstrations import DemonstrationConfig, collect, imitate, imitation, swingups
+from jaxpend.sac.networks import Actor, to_policy
 from jaxpend.score import official
 
 NOISY = DemonstrationConfig(episodes=4, duration=1.0, action_noise=0.4, kicks=0.5)

@@ -16,9 +16,9 @@ from jaxpend.controllers import OpenLoop
 from jaxpend.env import DoublePendulum, EnvConfig, Reward, surrogate_reward
 from jaxpend.observation import Observation
 from jaxpend.plant import rk4_step
-from jaxpend.randomisation import sample
 from jaxpend.rollout import rollout
 from jaxpend.scenario import Pulses
+from jaxpend.variations import sample
 
 LINE = {"acrobot": 0.375, "pendubot": 0.35}
 # The end effector of the second state lies between the lines of the two robots.

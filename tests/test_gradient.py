@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxpend import Policy, Scenario, designs, gradient
 from jaxpend.config import GradientConfig
 from jaxpend.controllers import energy_shaping
-from jaxpend.controllers.parameters import coordinates
+from jaxpend.controllers.search_space import coordinates
 from jaxpend.plant import rk4_step
 from jaxpend.scenario import Pulses
 from jaxpend.score import nominal, official, score_v2

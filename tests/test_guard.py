@@ -7,7 +7,7 @@ import pytest
 from conftest import assert_close, both_precisions, both_robots
 
 from jaxpend import JaxpendError, Scenario, designs, rollout
-from jaxpend.controllers import Feedback, Zero, guard, load_nominal, tvlqr
+from jaxpend.controllers import Feedback, Zero, guard, load_reference, tvlqr
 from jaxpend.controllers.guard import Guarded, Rescue, observer
 from jaxpend.plant import mass_matrix, rk4_step
 from jaxpend.robustness import strips
@@ -95,7 +95,7 @@ def test_the_error_has_all_its_poles_at_the_bandwidth():
 @both_robots
 def test_the_guard_leaves_a_swing_up_that_works_alone(robot):
     plant = designs.competition(robot)
-    main = tvlqr(plant, load_nominal(robot))
+    main = tvlqr(plant, load_reference(robot))
     alone = run(Scenario(plant), main, KEY)
     guarded = run(Scenario(plant), guard(main, robot), KEY)
     assert np.abs(guarded.x - alone.x).max() < 0.02
@@ -143,7 +143,7 @@ def test_what_spins_is_stopped_before_it_is_too_fast():
     """A driven joint that pushes by itself: TVLQR misses the top and spins it up."""
     plant = designs.competition("pendubot")
     pushing = Scenario(plant.replace(damping=np.array([-0.086, 0.0])))
-    main = tvlqr(plant, load_nominal("pendubot"), r=10.0)
+    main = tvlqr(plant, load_reference("pendubot"), r=10.0)
     assert upright(run(pushing, guard(main, "pendubot"), KEY).x[-1])
     assert not upright(run(pushing, guard(main, "pendubot", excess=np.inf), KEY).x[-1])
 
@@ -152,7 +152,7 @@ def test_velocity_noise_and_delay_do_not_reach_a_guarded_controller():
     """The worst velocity noise of the benchmark, under which the bare controller fails."""
     robot, plant = "acrobot", designs.competition("acrobot")
     worst = next(s for s in strips(plant) if s.variation == "velocity_noise").values[-1]
-    main = tvlqr(plant, load_nominal(robot))
+    main = tvlqr(plant, load_reference(robot))
     noisy = Scenario(plant, measurement_noise=worst * np.array([0.0, 0.0, 1.0, 1.0]))
     late = Scenario(plant, delay=delay_steps(0.04, mode="vel"))
     for wrong in (noisy, late):

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from jaxpend import JaxpendError, designs, ilqr, optimise, swingup
+from jaxpend import JaxpendError, designs
 from jaxpend.score import criteria, score_v2
+from jaxpend.trajopt import ilqr, swingup
+from jaxpend.trajopt import search as optimise
 
 
 @pytest.fixture(autouse=True)
@@ -138,23 +140,23 @@ def test_derivatives_of_the_step_match_finite_differences():
 
 def test_smooth_score_approaches_the_official_one():
     """On a shipped swing-up the smooth objective is the official penalty to a few thousandths."""
-    from jaxpend.controllers import load_nominal
+    from jaxpend.controllers import load_reference
 
-    nominal = load_nominal("pendubot")
-    p = swing(dt=nominal.dt, weight=0.0).replace(line_width=0.002, power_width=0.002)
-    z = jnp.column_stack([nominal.x[:-1], jnp.concatenate([nominal.u[:1], nominal.u[:-1]])])
+    reference = load_reference("pendubot")
+    p = swing(dt=reference.dt, weight=0.0).replace(line_width=0.002, power_width=0.002)
+    z = jnp.column_stack([reference.x[:-1], jnp.concatenate([reference.u[:1], reference.u[:-1]])])
     problem = swingup.problem()
     features = jax.vmap(problem.features, in_axes=(None, 0, 0, 0))
-    totals = jnp.sum(features(p, jnp.arange(nominal.steps), z, nominal.u), axis=0)
-    t = nominal.dt * jnp.arange(nominal.steps)
+    totals = jnp.sum(features(p, jnp.arange(reference.steps), z, reference.u), axis=0)
+    t = reference.dt * jnp.arange(reference.steps)
     found = criteria(
-        t, nominal.x[:-1], nominal.both(nominal.u[:, None]), p.plant, t_final=float(t[-1])
+        t, reference.x[:-1], reference.both(reference.u[:, None]), p.plant, t_final=float(t[-1])
     )
     names = ("swingup_time", "energy", "tau_cost", "velocity_cost")
     expected = [float(getattr(found, name)) for name in names]
     np.testing.assert_allclose(totals[np.array([0, 1, 2, 4])], expected, rtol=3e-3)
     # The official standard deviation is over this short run, ours over the 5000 steps of 10 s.
-    smoothness = jnp.sqrt(totals[3] / nominal.steps)
+    smoothness = jnp.sqrt(totals[3] / reference.steps)
     np.testing.assert_allclose(smoothness, found.tau_smoothness, rtol=1e-2)
     at_rest = found.__class__(**{**vars(found), "tau_smoothness": jnp.sqrt(totals[3] / 5000)})
     assert abs(1 - problem.outer(p, totals) - score_v2(at_rest)) < 1e-3

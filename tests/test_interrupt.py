@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from jaxpend.interrupt import Stopped, deferred, stop_if_asked
+from jaxpend.train.interrupt import Stopped, deferred, stop_if_asked
 
 
 @pytest.fixture(autouse=True)
@@ -61,7 +61,7 @@ def test_an_ignored_signal_stays_ignored():
 def test_a_second_signal_kills():
     code = """
 import os, signal
-from jaxpend.interrupt import deferred
+from jaxpend.train.interrupt import deferred
 signal.signal(signal.SIGINT, signal.default_int_handler)
 with deferred():
     os.kill(os.getpid(), signal.SIGINT)
@@ -76,7 +76,7 @@ with deferred():
 def test_an_interrupted_progress_bar_leaves_the_cursor_on():
     code = """
 import os, signal, time
-from jaxpend.interrupt import Stopped, deferred, stop_if_asked
+from jaxpend.train.interrupt import Stopped, deferred, stop_if_asked
 from jaxpend.terminal import LiveProgress
 signal.signal(signal.SIGINT, signal.default_int_handler)
 try:

@@ -6,13 +6,14 @@ import sys
 
 import pytest
 
-from jaxpend import JaxpendError, commands, designs, leaderboard
-from jaxpend.controllers import Zero, load_nominal, tvlqr
+from jaxpend import JaxpendError, designs, leaderboard
+from jaxpend.cli import commands
+from jaxpend.controllers import Zero, load_reference, tvlqr
 from jaxpend.robustness import CRITERIA
 
 
 def test_measured_and_published_rows_in_one_order():
-    make = lambda plant: tvlqr(plant, load_nominal("pendubot"))  # noqa: E731
+    make = lambda plant: tvlqr(plant, load_reference("pendubot"))  # noqa: E731
     chosen = {"tvlqr": ("TVLQR", make), "zero": ("Nothing", lambda plant: Zero())}
     board = leaderboard.leaderboard("pendubot", chosen, robustness=False)
     scores = [row["score"] for row in board["rows"]]

@@ -8,8 +8,8 @@ from conftest import assert_close, both_robots
 
 from jaxpend.designs import active_joint
 from jaxpend.env import DoublePendulum, EnvConfig
-from jaxpend.networks import Actor, TwinCritic, constant_log_std, sample_action, to_policy
 from jaxpend.observation import Observation
+from jaxpend.sac.networks import Actor, TwinCritic, constant_log_std, sample_action, to_policy
 
 STATES = np.random.default_rng(0).normal(size=(5, 4)).astype("f4") * [1, 2, 4, 8]
 OBS = np.random.default_rng(1).normal(size=(5, 7)).astype("f4")

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from jaxpend.designs import competition
-from jaxpend.randomisation import LONGEST_DELAY, sample
 from jaxpend.robustness import strips
+from jaxpend.variations import LONGEST_DELAY, sample
 
 PLANT = competition("acrobot")
 NOMINAL = {name: np.asarray(value) for name, value in vars(PLANT).items()}

@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxpend import cli, commands, load_policy, page, report, save_policy
+from jaxpend import cli, load_policy, save_policy
 from jaxpend.boards import PUBLISHED
+from jaxpend.cli import commands
 from jaxpend.config import TrainRun
 from jaxpend.controllers.policy import network_in
-from jaxpend.runs import to_mapping
+from jaxpend.report import page
+from jaxpend.runs import record as report
+from jaxpend.runs.folder import to_mapping
 from jaxpend.score import official
 
 # Characters that mean something in HTML must not.

@@ -11,12 +11,12 @@ import pytest
 from training_runs import arrays_of, result_of, rows_of
 
 from jaxpend import JaxpendError, Policy, load_policy, sac, snes
-from jaxpend.checkpoint import Checkpoints
 from jaxpend.config import EnvConfig, SACConfig, SACRun, SNESConfig
-from jaxpend.interrupt import Stopped
 from jaxpend.observation import Observation
-from jaxpend.stages import SAC, SNES
-from jaxpend.train import all_finite, train
+from jaxpend.runs.checkpoints import Checkpoints
+from jaxpend.train.interrupt import Stopped
+from jaxpend.train.loop import all_finite, train
+from jaxpend.train.stages import SAC, SNES
 
 SMALL = SACConfig(
     steps=96, eval_every=32, num_envs=8, batch_size=32, replay_capacity=128, warmup_steps=32,
@@ -95,7 +95,7 @@ def test_seeds_in_one_vmap_stop_resume_and_come_to_what_they_come_to_alone(tmp_p
         if len(looks) == 2:
             raise Stopped(signal.SIGINT)
 
-    monkeypatch.setattr("jaxpend.train.stop_if_asked", look)
+    monkeypatch.setattr("jaxpend.train.loop.stop_if_asked", look)
     with pytest.raises(Stopped, match="stopped in SAC at 32 of 96 steps; everything is in "):
         train(together)
     assert not (tmp_path / "together" / "seeds.json").exists()

@@ -11,11 +11,12 @@ import pytest
 from conftest import assert_close, both_robots, excerpt, refused
 from test_policy import random_policy
 
-from jaxpend import Scenario, cli, commands, load_policy, save_policy
+from jaxpend import Scenario, cli, load_policy, save_policy
 from jaxpend.boards import PUBLISHED
+from jaxpend.cli import commands
 from jaxpend.controllers import Feedback, Zero
-from jaxpend.controllers.known import find_controller
-from jaxpend.controllers.python import PythonLaw
+from jaxpend.controllers.callback import PythonLaw
+from jaxpend.controllers.catalogue import find_controller
 from jaxpend.designs import competition
 from jaxpend.robustness import CRITERIA, Strip, benchmark, passes, strips
 from jaxpend.scenario import delay_steps, random_pulses

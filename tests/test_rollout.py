@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxpend import Pulses, Scenario, final_state, rollout
-from jaxpend._struct import pytree
+from jaxpend.controller import Memoryless
 from jaxpend.controllers import Feedback, OpenLoop, Zero
-from jaxpend.controllers.base import Memoryless
 from jaxpend.designs import active_joint, competition
 from jaxpend.plant import euler_step, rk4_step
+from jaxpend.pytree import pytree
 from jaxpend.rollout import time_stamps
 from jaxpend.scenario import delay_steps
 from jaxpend.score import criteria, score_v1, score_v2

@@ -13,7 +13,7 @@ from conftest import limited_file_size, refused
 from jaxpend import JaxpendError, Policy, cli, load_policy
 from jaxpend.config import SNESRun, TrainRun
 from jaxpend.controllers.policy import read_header
-from jaxpend.runs import RunFolder, from_mapping, load_config, to_mapping
+from jaxpend.runs.folder import RunFolder, from_mapping, load_config, to_mapping
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 SECTIONS = ("policy", "guard", "sac", "snes")  # that a command may have no field for
@@ -105,7 +105,7 @@ def test_sections_of_other_commands_are_passed_over_only_where_said(tmp_path):
 
 @pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
 def test_the_recipes_are_valid_for_every_training_command(robot):
-    path = EXPERIMENTS / f"{robot}.yaml"
+    path = robot
     run = load_config(TrainRun(), path, SECTIONS)
     assert run.robot == run.sac.env.robot == robot
     assert run.sac.env.reward.line == {"acrobot": 0.375, "pendubot": 0.35}[robot]

@@ -13,10 +13,10 @@ import pytest
 from brax.envs.base import State
 from conftest import assert_close, refused
 
-from jaxpend import sac
 from jaxpend.env import EnvConfig, Reward
-from jaxpend.networks import constant_log_std
-from jaxpend.sac import SACConfig
+from jaxpend.sac import algorithm as sac
+from jaxpend.sac.algorithm import SACConfig
+from jaxpend.sac.networks import constant_log_std
 
 KEY = jax.random.key(0)
 ROW = 12  # observation (state, previous action), action, reward, next observation

@@ -12,15 +12,7 @@ from conftest import assert_close, both_precisions, both_robots, excerpt
 from jaxpend import JaxpendError
 from jaxpend.controllers import Zero
 from jaxpend.designs import competition
-from jaxpend.score import (
-    V1_DEFAULT,
-    V2_HARDWARE,
-    criteria,
-    imperfect,
-    score_v1,
-    score_v2,
-    score_v3,
-)
+from jaxpend.score import V1_DEFAULT, V2_HARDWARE, criteria, imperfect, score_v1, score_v2, score_v3
 
 SCORES = {
     "score_v1_default": lambda c: score_v1(c, V1_DEFAULT),

@@ -6,7 +6,7 @@ import pytest
 from conftest import assert_close
 
 from jaxpend.files import to_json
-from jaxpend.seeds import seeds_table, summary
+from jaxpend.runs.seeds import seeds_table, summary
 
 
 def results(scores):

@@ -10,7 +10,7 @@ import pytest
 from conftest import assert_close, refused, shipped_network
 
 from jaxpend import JaxpendError, Policy, designs, snes
-from jaxpend.controllers import load_nominal, lqr, tvlqr
+from jaxpend.controllers import load_reference, lqr, tvlqr
 from jaxpend.controllers.hybrid import with_lqr
 from jaxpend.score import Criteria, official, performance, score_v2
 from jaxpend.snes import SNESConfig
@@ -234,7 +234,7 @@ def test_any_controller_has_a_fitness_and_only_policies_have_action_noise(fit):
     np.testing.assert_allclose(quiet, official(hybrid, "pendubot")["score"], atol=2e-3)
     assert 0 < fit(noisy, hybrid, KEY, "pendubot")[0] < quiet - 0.01
     # No policy, no noise: one rollout, that counts once if it is lost.
-    tracking = tvlqr(plant, load_nominal("pendubot"))
+    tracking = tvlqr(plant, load_reference("pendubot"))
     score, diverged = fit(noisy, tracking, KEY, "pendubot")
     np.testing.assert_allclose(score, official(tracking, "pendubot")["score"], atol=2e-3)
     sick = tracking.replace(gain=tracking.gain * jnp.nan)

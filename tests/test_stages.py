@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from conftest import shipped_network
 
-from jaxpend import stages
 from jaxpend.config import GradientConfig, SNESConfig
 from jaxpend.score import Criteria, nominal, score_v2
+from jaxpend.train import stages
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ import pytest
 
 from jaxpend import JaxpendError
 from jaxpend.config import SNESRun
-from jaxpend.runs import RunFolder
-from jaxpend.tensorboard import Events
+from jaxpend.runs.folder import RunFolder
+from jaxpend.runs.tensorboard import Events
 
 ROWS = [
     {"stage": "sac", "seconds": 0.5, "env_steps": 64, "updates": 8, "score": 0.25, "loss": None},

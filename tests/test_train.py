@@ -20,11 +20,11 @@ from training_runs import OPTIONS, arrays_of, result_of, rows_of, training
 from jaxpend import Policy, cli, designs, load_policy, save_policy
 from jaxpend.config import GradientConfig, GradientRun, SACRun, SNESConfig, SNESRun, TrainRun
 from jaxpend.controllers import Guarded, load_controller
-from jaxpend.controllers.known import build
+from jaxpend.controllers.catalogue import build
 from jaxpend.controllers.policy import network_in, read_header
-from jaxpend.interrupt import Stopped
 from jaxpend.score import official
-from jaxpend.train import stages_of, train
+from jaxpend.train.interrupt import Stopped
+from jaxpend.train.loop import stages_of, train
 
 CRITERIA = {
     "swingup_time", "energy", "tau_cost", "tau_smoothness", "velocity_cost", "max_tau",
@@ -249,7 +249,7 @@ def test_snes_fine_tunes_any_controller_and_goes_on_where_it_was(monkeypatch, tm
             raise now
 
     with monkeypatch.context() as patch:
-        patch.setattr("jaxpend.train.stop_if_asked", stop)
+        patch.setattr("jaxpend.train.loop.stop_if_asked", stop)
         with pytest.raises(Stopped):
             train(run)
     assert train(run)["score"] == result["score"]

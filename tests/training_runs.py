@@ -6,11 +6,10 @@ import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 
-RECIPE = Path(__file__).parents[1] / "experiments" / "pendubot.yaml"
+RECIPE = "pendubot"
 OPTIONS = f"""
     --config {RECIPE} --seed 3 --run run --sac.steps 1024 --sac.eval-every 32 --sac.num-envs 8
     --sac.batch-size 32 --sac.replay-capacity 128 --sac.critic-hidden 8 --sac.actor-hidden 8

@@ -1,16 +1,16 @@
 """Controllers, one a file, all on the protocol of ``base.Controller``."""
 
-from .base import Controller, Feedback, OpenLoop, Zero
+from ..controller import Controller, Feedback, OpenLoop, Zero
+from ..trajopt.reference import Reference, load_reference, save_reference
 from .energy import EnergyShaping, energy_shaping
+from .files import load_controller, save_controller
 from .guard import Guarded, guard
 from .hybrid import Ellipsoid, Hybrid, Tolerances, ellipsoid, ellipsoid_of_torque
 from .lqr import LQR, delay_tolerant, lqr
 from .mpc import MPC, free_mpc, tracking_mpc
-from .nominal import Nominal, load_nominal, save_nominal
 from .pd import PD, pd
 from .policy import Policy, load_policy, save_policy
 from .riccati import Riccati, riccati
-from .saved import load_controller, save_controller
 from .tvlqr import TVLQR, tvlqr
 
 __all__ = [
@@ -24,9 +24,9 @@ __all__ = [
     "Feedback",
     "Guarded",
     "Hybrid",
-    "Nominal",
     "OpenLoop",
     "Policy",
+    "Reference",
     "Riccati",
     "Tolerances",
     "Zero",
@@ -37,14 +37,14 @@ __all__ = [
     "free_mpc",
     "guard",
     "load_controller",
-    "load_nominal",
     "load_policy",
+    "load_reference",
     "lqr",
     "pd",
     "riccati",
     "save_controller",
-    "save_nominal",
     "save_policy",
+    "save_reference",
     "tracking_mpc",
     "tvlqr",
 ]

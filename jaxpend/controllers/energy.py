@@ -21,12 +21,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._struct import pytree, static
+from ..controller import Memoryless
 from ..designs import active_joint
 from ..plant import Plant, dynamics, mass_matrix, total_energy
-from .base import Memoryless
+from ..pytree import pytree, static
 from .lqr import deviation
-from .parameters import FACTOR
+from .search_space import FACTOR
 
 __all__ = ["EnergyShaping", "energy_shaping"]
 

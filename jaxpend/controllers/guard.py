@@ -22,15 +22,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._struct import pytree, static
+from ..controller import Controller
 from ..designs import competition
 from ..errors import JaxpendError
 from ..plant import Plant, rk4_step, total_energy
-from .base import Controller
+from ..pytree import pytree, static
 from .energy import energy_shaping
 from .hybrid import with_lqr
 from .lqr import deviation
-from .parameters import FACTOR
+from .search_space import FACTOR
 
 __all__ = ["Guarded", "Observer", "Rescue", "guard", "observer"]
 

@@ -5,11 +5,11 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from .._struct import pytree
+from ..controller import Controller
 from ..plant import Plant
-from .base import Controller
+from ..pytree import pytree
 from .lqr import LQR, deviation, lqr
-from .parameters import FACTOR
+from .search_space import FACTOR
 
 __all__ = ["Ellipsoid", "Hybrid", "Tolerances", "ellipsoid", "ellipsoid_of_torque", "with_lqr"]
 

@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._struct import pytree
+from ..controller import Memoryless
 from ..designs import active_joint
 from ..errors import JaxpendError
 from ..plant import Plant, linearize
-from .base import Memoryless
-from .parameters import FACTOR
+from ..pytree import pytree
+from .search_space import FACTOR
 
 __all__ = ["LQR", "delay_tolerant", "deviation", "lqr"]
 

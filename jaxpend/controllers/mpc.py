@@ -17,15 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._struct import pytree, static
 from ..designs import active_joint
 from ..errors import JaxpendError
-from ..ilqr import Problem, Solution, iterate, solve, warm_start
 from ..plant import Plant
-from ..swingup import step
+from ..pytree import pytree, static
+from ..trajopt.ilqr import Problem, Solution, iterate, solve, warm_start
+from ..trajopt.reference import Reference
+from ..trajopt.swingup import step
 from .lqr import DEFAULT_Q, deviation, lqr
-from .nominal import Nominal
-from .parameters import FACTOR
+from .search_space import FACTOR
 from .tvlqr import along
 
 __all__ = ["MPC", "free_mpc", "tracking_mpc"]
@@ -164,7 +164,7 @@ class MPC:
 
 def tracking_mpc(
     plant: Plant,
-    nominal: Nominal,
+    reference: Reference,
     *,
     q: tuple[float, ...] = DEFAULT_Q,
     r: float = 10.0,
@@ -180,23 +180,23 @@ def tracking_mpc(
     Raises:
         JaxpendError: a horizon, ``every`` or ``iterations`` that do not fit, and as ``lqr``.
     """
-    _check(horizon, every, iterations, nominal.steps)
-    gain, cost_to_go, top = along(plant, nominal, q=q, r=r)
-    dtype = nominal.x.dtype
-    z = jnp.column_stack([nominal.x, jnp.concatenate([jnp.zeros(1, dtype), nominal.u])])
+    _check(horizon, every, iterations, reference.steps)
+    gain, cost_to_go, top = along(plant, reference, q=q, r=r)
+    dtype = reference.x.dtype
+    z = jnp.column_stack([reference.x, jnp.concatenate([jnp.zeros(1, dtype), reference.u])])
     gain = jnp.pad(-gain, ((0, 0), (0, 1)))
     return MPC(
         plant=plant,
-        x_ref=jnp.concatenate([nominal.x[:-1], nominal.goal[None]]),
-        u_ref=nominal.u,
+        x_ref=jnp.concatenate([reference.x[:-1], reference.goal[None]]),
+        u_ref=reference.u,
         cost_to_go=jnp.concatenate([cost_to_go, top.cost_to_go[None]]),
         q=jnp.asarray(q, dtype),
         r=jnp.asarray(r, dtype),
         smoothness=jnp.asarray(smoothness, dtype),
-        first=_plan(z[: horizon + 1], nominal.u[:horizon], gain[:horizon]),
-        joint=active_joint(nominal.robot),
+        first=_plan(z[: horizon + 1], reference.u[:horizon], gain[:horizon]),
+        joint=active_joint(reference.robot),
         horizon=horizon,
-        dt=nominal.dt,
+        dt=reference.dt,
         every=every,
         iterations=iterations,
     )

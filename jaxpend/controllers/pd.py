@@ -5,12 +5,12 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from .._struct import pytree
+from ..controller import Memoryless
 from ..designs import active_joint
 from ..plant import Plant
-from .base import Memoryless
+from ..pytree import pytree
 from .lqr import deviation
-from .parameters import FACTOR
+from .search_space import FACTOR
 
 __all__ = ["PD", "pd"]
 

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import config
-from .._struct import pytree, static
 from ..arrays import read_arrays, write_arrays
+from ..controller import Controller
 from ..designs import ROBOTS, active_joint
 from ..errors import JaxpendError, choose
 from ..observation import Observation
-from .base import Controller
-from .parameters import WEIGHT
+from ..pytree import pytree, static
+from .search_space import WEIGHT
 
 __all__ = ["ACTIVATIONS", "Policy", "load_policy", "save_policy"]
 
@@ -158,7 +158,7 @@ def save_policy(
         JaxpendError: a controller with no policy in it; use ``save_controller``.
     """
     if not isinstance(policy, Policy):
-        from .saved import save_controller
+        from .files import save_controller
 
         return save_controller(path, policy, network_in(policy).robot, provenance)
     arrays = {}
@@ -199,7 +199,7 @@ def load_policy(robot_or_path: str | Path, *, robot: str | None = None) -> Contr
     """
     path = _locate(robot_or_path)
     if read_header(path).get("kind") == "controller":
-        from .saved import load_controller  # it knows all controllers, this one too
+        from .files import load_controller  # it knows all controllers, this one too
 
         return load_controller(path, robot=robot)
     header, arrays = _read(path)

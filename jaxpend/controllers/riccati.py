@@ -11,11 +11,11 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from .._struct import pytree
 from ..plant import Plant
+from ..pytree import pytree
+from ..trajopt.reference import Reference
 from .lqr import DEFAULT_Q, DEFAULT_R, LQR, deviation, lqr
-from .nominal import Nominal
-from .parameters import OVER_TIME
+from .search_space import OVER_TIME
 
 __all__ = ["Riccati", "riccati"]
 
@@ -24,35 +24,37 @@ __all__ = ["Riccati", "riccati"]
 class Riccati:
     """Feed-forward and iLQR gains along a trajectory, then the LQR at its end."""
 
-    SEARCHED: ClassVar = {"nominal.gain": OVER_TIME}
-    nominal: Nominal
+    SEARCHED: ClassVar = {"reference.gain": OVER_TIME}
+    reference: Reference
     top: LQR
 
     def reset(self, key: jax.Array) -> jax.Array:
         """The last torque of the driven joint: none yet."""
-        return jnp.zeros((), self.nominal.u.dtype)
+        return jnp.zeros((), self.reference.u.dtype)
 
     def __call__(self, carry, t, x):
         """Last torque and torque (2,), N m: the step nearest to ``t``; past the end, the LQR's."""
-        nominal = self.nominal
-        index = nominal.index(t)
-        k = jnp.clip(index, 0, nominal.steps - 1)
-        last = carry - nominal.u[jnp.maximum(k - 1, 0)]
-        error = jnp.append(deviation(x, nominal.x[k]), last)
+        reference = self.reference
+        index = reference.index(t)
+        k = jnp.clip(index, 0, reference.steps - 1)
+        last = carry - reference.u[jnp.maximum(k - 1, 0)]
+        error = jnp.append(deviation(x, reference.x[k]), last)
         limit = self.top.torque_limit
-        following = jnp.clip(nominal.both(nominal.u[k] + nominal.gain[k] @ error), -limit, limit)
+        following = jnp.clip(
+            reference.both(reference.u[k] + reference.gain[k] @ error), -limit, limit
+        )
         _, holding = self.top(None, t, x)
-        torque = jnp.where(index < nominal.steps, following, holding)
+        torque = jnp.where(index < reference.steps, following, holding)
         return jnp.sum(torque).astype(carry.dtype), torque
 
 
 def riccati(
-    plant: Plant, nominal: Nominal, *, q: tuple[float, ...] = DEFAULT_Q, r: float = DEFAULT_R
+    plant: Plant, reference: Reference, *, q: tuple[float, ...] = DEFAULT_Q, r: float = DEFAULT_R
 ) -> Riccati:
-    """The controller along ``nominal``; ``q`` and ``r`` are those of the LQR at its end.
+    """The controller along ``reference``; ``q`` and ``r`` are those of the LQR at its end.
 
     Raises ``JaxpendError`` as ``lqr``.
     """
-    top = lqr(plant, nominal.robot, q=q, r=r, dt=nominal.dt)
-    top = jax.tree.map(lambda v: v.astype(nominal.x.dtype), top)
-    return Riccati(nominal, top.replace(goal=nominal.goal))
+    top = lqr(plant, reference.robot, q=q, r=r, dt=reference.dt)
+    top = jax.tree.map(lambda v: v.astype(reference.x.dtype), top)
+    return Riccati(reference, top.replace(goal=reference.goal))

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._struct import pytree
+from ..controller import Memoryless
 from ..plant import Plant, rk4_step
-from .base import Memoryless
+from ..pytree import pytree
+from ..trajopt.reference import Reference
 from .lqr import DEFAULT_Q, DEFAULT_R, LQR, delay_tolerant, deviation, lqr
-from .nominal import Nominal
-from .parameters import OVER_TIME
+from .search_space import OVER_TIME
 
 __all__ = ["TVLQR", "along", "tvlqr"]
 
@@ -31,31 +31,31 @@ class TVLQR(Memoryless):
     """Feed-forward and time-varying gains along a trajectory, then the LQR at its end."""
 
     SEARCHED: ClassVar = {"gain": OVER_TIME}
-    nominal: Nominal
+    reference: Reference
     gain: jax.Array  # (N, 4) N m per state unit, of the driven joint
     top: LQR
 
     def __call__(self, carry, t, x):
         """Torque (2,), N m: the step nearest to ``t``; past the last one, the LQR's."""
-        nominal = self.nominal
-        index = nominal.index(t)
-        k = jnp.clip(index, 0, nominal.steps - 1)
-        torque = nominal.u[k] - self.gain[k] @ deviation(x, nominal.x[k])
+        reference = self.reference
+        index = reference.index(t)
+        k = jnp.clip(index, 0, reference.steps - 1)
+        torque = reference.u[k] - self.gain[k] @ deviation(x, reference.x[k])
         limit = self.top.torque_limit
-        tracking = jnp.clip(nominal.both(torque), -limit, limit)
+        tracking = jnp.clip(reference.both(torque), -limit, limit)
         _, holding = self.top(None, t, x)
-        return carry, jnp.where(index < nominal.steps, tracking, holding)
+        return carry, jnp.where(index < reference.steps, tracking, holding)
 
 
 @jax.jit
-def _riccati(plant: Plant, nominal: Nominal, q: jax.Array, r: float, p_end: jax.Array):
+def _riccati(plant: Plant, reference: Reference, q: jax.Array, r: float, p_end: jax.Array):
     """Gains (N, 4) and costs-to-go (N, 4, 4) of the finite-horizon problem."""
 
     def step(x, torque):
-        return rk4_step(plant, x, nominal.both(torque), nominal.dt)
+        return rk4_step(plant, x, reference.both(torque), reference.dt)
 
-    a, b = jax.vmap(jax.jacfwd(step, argnums=(0, 1)))(nominal.x[:-1], nominal.u)
-    q, r = nominal.dt * jnp.diag(q), nominal.dt * r
+    a, b = jax.vmap(jax.jacfwd(step, argnums=(0, 1)))(reference.x[:-1], reference.u)
+    q, r = reference.dt * jnp.diag(q), reference.dt * r
 
     def backward(p, now):
         a, b = now
@@ -68,37 +68,37 @@ def _riccati(plant: Plant, nominal: Nominal, q: jax.Array, r: float, p_end: jax.
 
 
 def along(
-    plant: Plant, nominal: Nominal, *, q: tuple[float, ...] = DEFAULT_Q, r: float = DEFAULT_R
+    plant: Plant, reference: Reference, *, q: tuple[float, ...] = DEFAULT_Q, r: float = DEFAULT_R
 ) -> tuple[jax.Array, jax.Array, LQR]:
     """Gains (N, 4), costs-to-go (N, 4, 4) and the LQR at the end, of the tracking problem.
 
-    Solved in float64, returned in the dtype of ``nominal``. Arguments and errors as ``tvlqr``.
+    Solved in float64, returned in the dtype of ``reference``. Arguments and errors as ``tvlqr``.
     """
-    dtype = nominal.x.dtype
+    dtype = reference.x.dtype
     with jax.enable_x64(True):
         exact_plant, exact_nominal = jax.tree.map(
-            lambda v: jnp.asarray(np.asarray(v), jnp.float64), (plant, nominal)
+            lambda v: jnp.asarray(np.asarray(v), jnp.float64), (plant, reference)
         )
-        top = lqr(exact_plant, nominal.robot, q=q, r=r, dt=nominal.dt)
+        top = lqr(exact_plant, reference.robot, q=q, r=r, dt=reference.dt)
         weights = jnp.asarray(np.asarray(q, float))
         gain, cost_to_go = _riccati(exact_plant, exact_nominal, weights, r, top.cost_to_go)
-        found = jax.tree.map(np.asarray, (gain, cost_to_go, top.replace(goal=nominal.goal)))
+        found = jax.tree.map(np.asarray, (gain, cost_to_go, top.replace(goal=reference.goal)))
     return jax.tree.map(lambda v: jnp.asarray(v, dtype), found)
 
 
 def tvlqr(
     plant: Plant,
-    nominal: Nominal,
+    reference: Reference,
     *,
     q: tuple[float, ...] = DEFAULT_Q,
     r: float = DEFAULT_R,
     delay: float = 0.0,
 ) -> TVLQR:
-    """TVLQR along ``nominal``, solved in float64; the result has the dtype of ``nominal``.
+    """TVLQR along ``reference``, solved in float64; the result has the dtype of ``reference``.
 
     Args:
         plant: one plant, concrete arrays.
-        nominal: the trajectory.
+        reference: the trajectory.
         q: (4,) diagonal of Q, of the tracking and of the LQR at the end.
         r: 1/(N m)^2.
         delay: s; if not 0, the gain at the end is ``delay_tolerant``, and takes over as soon as
@@ -107,13 +107,13 @@ def tvlqr(
     Raises:
         JaxpendError: as ``lqr`` and ``delay_tolerant``.
     """
-    gain, _, top = along(plant, nominal, q=q, r=r)
+    gain, _, top = along(plant, reference, q=q, r=r)
     if delay:
-        top = delay_tolerant(top, plant, delay, dt=nominal.dt)
-        off = np.abs(np.asarray(nominal.x - nominal.goal)).max(axis=1)
-        steps = min(int(np.argmax(off < ARRIVED)) or nominal.steps, nominal.steps)
-        nominal = nominal.replace(
-            x=nominal.x[: steps + 1], u=nominal.u[:steps], gain=nominal.gain[:steps]
+        top = delay_tolerant(top, plant, delay, dt=reference.dt)
+        off = np.abs(np.asarray(reference.x - reference.goal)).max(axis=1)
+        steps = min(int(np.argmax(off < ARRIVED)) or reference.steps, reference.steps)
+        reference = reference.replace(
+            x=reference.x[: steps + 1], u=reference.u[:steps], gain=reference.gain[:steps]
         )
         gain = gain[:steps]
-    return TVLQR(nominal, gain, top)
+    return TVLQR(reference, gain, top)

@@ -1,0 +1,223 @@
+"""Charts of a swing-up and of learning: each draws on the axes it is given (see ``plots``)."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, MultipleLocator, NullFormatter
+
+from ..runs.statistics import interquartile_mean, interval
+from .figures import PALETTE
+
+__all__ = [
+    "draw_angles",
+    "draw_curves",
+    "draw_height",
+    "draw_phase",
+    "draw_torque",
+    "draw_velocities",
+]
+
+# --- a swing-up ----------------------------------------------------------------------------
+
+
+def _turns(value: float, _position: int = 0) -> str:
+    """An angle in multiples of pi: "0", "π/2", "-3π/2"."""
+    halves = round(2 * value / np.pi)
+    if halves == 0:
+        return "0"
+    number, sign = abs(halves), "\N{MINUS SIGN}" if halves < 0 else ""
+    if number % 2:
+        return f"{sign}{'' if number == 1 else number}π/2"
+    return f"{sign}{'' if number == 2 else number // 2}π"
+
+
+def _angle_axis(axis, values: np.ndarray) -> None:
+    """Ticks at half turns, turns, or less often where the arm went round and round.
+
+    Plain radians where it hardly moved, or too far.
+    """
+    turns = (values.max() - values.min()) / np.pi
+    steps = [s for s in (0.5, 1, 2, 4, 10, 20, 40, 100, 200) if turns / s <= 6]
+    if steps and turns > 0.75:
+        axis.set_major_locator(MultipleLocator(steps[0] * np.pi))
+        axis.set_major_formatter(FuncFormatter(_turns))
+
+
+def _legend(axes) -> None:
+    """Beside the title, where no data are."""
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0.1, borderpad=0.2,
+        handlelength=1.1, handletextpad=0.5, columnspacing=1.2,
+    )  # fmt: skip
+
+
+def _goals(x: np.ndarray) -> tuple[float, float]:
+    """The angles of upright, rad, that are nearest to the last of the states (n, 4)."""
+    full = 2 * np.pi
+    turn1, turn2 = round((x[-1, 0] - np.pi) / full), round(x[-1, 1] / full)
+    return np.pi + turn1 * full, turn2 * full
+
+
+def _time_axis(axes, end: float, up: float | None, label: bool = False) -> None:
+    """Time from 0 to ``end`` s, with a line where the swing-up is done."""
+    axes.set_xlim(0, end)
+    axes.set_xlabel("time [s]")
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    if up is not None:
+        axes.axvline(up, color=PALETTE["ink"], linewidth=1, linestyle=(0, (1, 1.5)))
+        if label:
+            axes.annotate(
+                f"up at {up:.2f} s", (up, 0), xycoords=("data", "axes fraction"),
+                xytext=(5, 5), textcoords="offset points", va="bottom", fontsize=10,
+            )  # fmt: skip
+
+
+def _goal(axes, height: float, colour: str) -> None:
+    axes.axhline(height, color=PALETTE[colour], linewidth=1, linestyle=(0, (5, 3)), alpha=0.8)
+
+
+def draw_angles(axes, t, x, end: float, up: float | None = None) -> None:
+    """Both angles over time (n,), s, of states (n, 4), with the goal as dashed lines."""
+    shown = t <= end
+    for joint, colour in enumerate(("one", "two")):
+        axes.plot(t[shown], x[shown, joint], color=PALETTE[colour], label="θ" + "₁₂"[joint])
+        _goal(axes, _goals(x)[joint], colour)
+    _angle_axis(axes.yaxis, np.append(x[shown, :2], _goals(x)))
+    _time_axis(axes, end, up, label=True)
+    axes.set_ylabel("angle [rad]")
+    axes.set_title("Angles")
+    _legend(axes)
+
+
+def draw_velocities(axes, t, x, end: float, up: float | None = None) -> None:
+    """Both velocities over time; the goal is 0."""
+    shown = t <= end
+    for joint, colour in enumerate(("one", "two")):
+        axes.plot(t[shown], x[shown, 2 + joint], color=PALETTE[colour], label="ω" + "₁₂"[joint])
+    _goal(axes, 0, "muted")
+    _time_axis(axes, end, up)
+    axes.set_ylabel("velocity [rad/s]")
+    axes.set_title("Velocities")
+    _legend(axes)
+
+
+def draw_torque(axes, t, u, joint: int, limit: float, end: float, up: float | None = None) -> None:
+    """Torque of the driven joint, N m, held between time stamps, with its limits dashed."""
+    shown = t[: len(u)] <= end
+    axes.step(t[: len(u)][shown], u[shown, joint], where="post", color=PALETTE["three"])
+    for side in (-limit, limit):
+        _goal(axes, side, "muted")
+    axes.annotate(
+        f"limit ±{limit:g} N m", (1, limit), xycoords=("axes fraction", "data"), ha="right",
+        xytext=(0, -3), textcoords="offset points", va="top", fontsize=10,
+        color=PALETTE["muted"],
+    )  # fmt: skip
+    axes.set_ylim(-1.12 * limit, 1.12 * limit)
+    _time_axis(axes, end, up)
+    axes.set_ylabel(f"torque τ{'₁₂'[joint]} [N m]")
+    axes.set_title("Torque")
+
+
+def draw_height(axes, t, x, length, end: float, up: float | None = None) -> None:
+    """Height of the end effector above joint 1, and the line at 0.9 of what it can reach."""
+    shown, reach = t <= end, length[0] + length[1]
+    y = -length[0] * np.cos(x[:, 0]) - length[1] * np.cos(x[:, 0] + x[:, 1])
+    axes.plot(t[shown], y[shown], color=PALETTE["ink"])
+    _goal(axes, 0.9 * reach, "three")
+    axes.annotate(
+        "0.9 line", (1, 0.9 * reach), xycoords=("axes fraction", "data"), ha="right",
+        xytext=(0, -3), textcoords="offset points", va="top", fontsize=10,
+        color=PALETTE["three"],
+    )  # fmt: skip
+    axes.set_ylim(-1.12 * reach, 1.12 * reach)
+    _time_axis(axes, end, up)
+    axes.set_ylabel("height [m]")
+    axes.set_title("Height of the end effector")
+
+
+def draw_phase(axes, x, joint: int) -> None:
+    """Velocity over angle of one joint, from rest to the goal."""
+    colour = PALETTE[("one", "two")[joint]]
+    axes.plot(x[:, joint], x[:, 2 + joint], color=colour, linewidth=1.4)
+    marks = {"marker": "o", "markersize": 8, "linestyle": "none", "markeredgewidth": 1.6}
+    axes.plot(x[0, joint], x[0, 2 + joint], color=PALETTE["ink"], label="start", **marks)
+    goal = _goals(x)[joint]
+    axes.plot(
+        goal, 0, color=PALETTE["ink"], markerfacecolor="none", label="goal",
+        **marks | {"markersize": 11},
+    )  # fmt: skip
+    _angle_axis(axes.xaxis, np.append(x[:, joint], goal))
+    number = "₁₂"[joint]
+    axes.set_xlabel(f"angle θ{number} [rad]")
+    axes.set_ylabel(f"velocity ω{number} [rad/s]")
+    axes.set_title(f"Phase portrait, joint {joint + 1}")
+    _legend(axes)
+
+
+# --- learning ------------------------------------------------------------------------------
+
+
+def _thousands(value: float, _position: int = 0) -> str:
+    """Steps: "250k", "1.5M"."""
+    for size, letter in ((1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:g}{letter}"
+    return f"{value:g}"
+
+
+def _calm(axes, least: float = 0.01) -> None:
+    """No axis spans less than this share of its values: noise is not to look like news."""
+    low, high = axes.get_ylim()
+    missing = least * max(abs(low), abs(high)) - (high - low)
+    if missing > 0:
+        axes.set_ylim(low - missing / 2, high + missing / 2)
+
+
+def _log_axis(axes) -> None:
+    """A logarithmic axis with plain numbers."""
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1,) if high > 300 * low else (1, 2, 5)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def draw_curves(
+    axes,
+    title: str,
+    curves: Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]],
+    *,
+    xlabel: str,
+    ylabel: str = "",
+    log: bool = False,
+) -> None:
+    """Learning curves: label -> for every seed what is on x and on y, each (n,).
+
+    One seed is drawn as it is. Of several, every one is thin, and the interquartile mean over
+    those x that all have is thick, in its bootstrap band.
+    """
+    for (label, seeds), colour in zip(curves.items(), ("one", "two", "three"), strict=False):
+        seeds = [(x, y) for x, y in seeds if len(x)]
+        several = len(seeds) > 1
+        for x, y in seeds:
+            thin = {"linewidth": 0.8, "alpha": 0.55} if several else {"label": label}
+            marker = "o" if len(x) == 1 else None
+            axes.plot(x, y, color=PALETTE[colour], marker=marker, **thin)
+        if several:
+            common = sorted(set.intersection(*(set(x.tolist()) for x, _ in seeds)))
+            ys = np.array([[y[list(x).index(at)] for at in common] for x, y in seeds])
+            low, high = interval(ys)
+            axes.fill_between(common, low, high, color=PALETTE[colour], alpha=0.22, linewidth=0)
+            mean = interquartile_mean(ys)
+            axes.plot(common, mean, color=PALETTE[colour], linewidth=2.6, label=label)
+    if log:
+        _log_axis(axes)
+    else:
+        _calm(axes)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.xaxis.set_major_formatter(FuncFormatter(_thousands))
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
+    axes.set_title(title)
+    if len(curves) > 1:
+        _legend(axes)

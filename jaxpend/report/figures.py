@@ -1,0 +1,265 @@
+"""Pictures, and the CSV and JSON files beside them. Imported only by commands that draw.
+
+A chart is a function that draws on the axes it is given: alone, the width of a phone, for the
+page of a report (``panel`` and ``svg``), or beside others for a PNG file (``stack``).
+"""
+
+import csv
+import io
+import json
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..files import to_json, write_atomically
+from ..robustness import CRITERIA
+from ..variations import VARIATIONS
+
+__all__ = [
+    "PALETTE",
+    "map_figure",
+    "panel",
+    "robustness_figure",
+    "save",
+    "stack",
+    "strips_figure",
+    "styled",
+    "svg",
+    "write_robustness",
+]
+
+# Okabe and Ito's colours, told apart by eyes of every kind. A page puts its own in their place
+# (``svg``), by these names, so that it can be light or dark.
+PALETTE = {
+    "ink": "#1a1d21", "muted": "#5d6570", "grid": "#dfe2e6", "paper": "#fffffe",
+    "one": "#0072b2", "two": "#d55e00", "three": "#009e73", "four": "#cc79a7",
+}  # fmt: skip
+# From failure to success: dark red, pale, dark blue.
+COLOURS = "RdYlBu"
+STYLE = {
+    "axes.edgecolor": PALETTE["muted"], "axes.labelcolor": PALETTE["ink"],
+    "axes.facecolor": "none", "axes.titlecolor": PALETTE["ink"], "axes.titlelocation": "left",
+    "axes.titlesize": "medium", "axes.titleweight": "bold", "axes.labelsize": "medium",
+    "axes.grid": True, "axes.axisbelow": True, "axes.spines.top": False,
+    "axes.spines.right": False, "axes.linewidth": 0.8, "grid.color": PALETTE["grid"],
+    "grid.linewidth": 0.8, "xtick.color": PALETTE["muted"], "ytick.color": PALETTE["muted"],
+    "xtick.labelcolor": PALETTE["ink"], "ytick.labelcolor": PALETTE["ink"],
+    "text.color": PALETTE["ink"], "legend.frameon": False, "legend.fontsize": 10,
+    "lines.linewidth": 1.8, "lines.solid_joinstyle": "round", "font.size": 11,
+    "svg.fonttype": "none", "svg.hashsalt": "jaxpend", "figure.facecolor": PALETTE["paper"],
+}  # fmt: skip
+styled = matplotlib.rc_context(STYLE)
+
+
+def save(figure: Figure, path: Path, dpi: int = 150) -> None:
+    """Write a figure as PNG, atomically."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    write_atomically(path, buffer.getvalue())
+
+
+@styled
+def svg(figure: Figure, name: str, label: str) -> str:
+    """A figure as an ``<svg>`` element for a page that defines ``--ink``, ``--one``, ...
+
+    ``name`` keeps its ids apart from those of other figures; ``label`` is what a screen reader
+    says.
+    """
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{name}-", text)
+    for variable, colour in PALETTE.items():
+        text = text.replace(colour, f"var(--{variable})")
+    label = label.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
+    return text.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
+
+
+@styled
+def panel(draw: Callable[..., Any], *data: Any, size: tuple[float, float] = (4.4, 2.9), **options):
+    """``draw(axes, *data, **options)`` alone on a figure of ``size``, inches."""
+    figure = Figure(figsize=size, layout="constrained")
+    draw(figure.add_subplot(), *data, **options)
+    return figure
+
+
+@styled
+def stack(
+    draws: Sequence[Callable[..., Any]],
+    columns: int = 1,
+    size: tuple[float, float] = (4.4, 2.9),
+    title: str = "",
+) -> Figure:
+    """Charts in a grid on one figure, for a file; each is called with its axes."""
+    rows = -(-len(draws) // columns)
+    figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
+    for number, draw in enumerate(draws):
+        draw(figure.add_subplot(rows, columns, number + 1))
+    figure.suptitle(title, fontweight="bold")
+    return figure
+
+
+# --- robustness ----------------------------------------------------------------------------
+
+
+def _bars(axes, result: dict[str, Any], first: bool) -> None:
+    """The six scores and the overall one, with the range over keys as whiskers."""
+    over, names = result["over_keys"], list(reversed(CRITERIA))
+    titles = ["Overall", *(CRITERIA[name] for name in names)]
+    values = [result["overall"], *(result["scores"][name] for name in names)]
+    ranges = [over["overall"], *(over["scores"].get(n, [result["scores"][n]]) for n in names)]
+    colours = [PALETTE["ink"]] + [PALETTE["one"]] * len(CRITERIA)
+    axes.barh(range(len(values)), values, color=colours, height=0.7)
+    for y, (value, spread) in enumerate(zip(values, ranges, strict=True)):
+        if len(spread) > 1:
+            axes.plot([min(spread), max(spread)], [y, y], color="#e69f00", linewidth=2)
+        end = max([value, *spread])
+        inside = end > 0.85
+        axes.text(
+            min(value, min(spread)) - 0.015 if inside else end + 0.015, y, f"{100 * value:.1f}",
+            va="center", ha="right" if inside else "left",
+            color=PALETTE["paper" if inside else "ink"],
+        )  # fmt: skip
+    axes.set_yticks(range(len(titles)), titles if first else [""] * len(titles))
+    axes.tick_params(axis="y", length=0)
+    axes.set_xlim(0, 1)
+    axes.set_xticks([0, 0.5, 1], ["0", "50", "100 %"])
+    axes.grid(False)
+    axes.set_title(result["robot"], loc="center")
+
+
+def _strips(axes, result: dict[str, Any], first: bool, margin: float = 0.18) -> Any:
+    """One row a grid: every value coloured by the fraction of its runs that succeed.
+
+    ``margin`` is the room for the ends of a grid, in widths of a row.
+    """
+    rows = [
+        (name, grid)
+        for criterion in CRITERIA
+        for name, grid in result["criteria"][criterion]["grids"].items()
+    ]
+    for y, (name, grid) in enumerate(rows):
+        success, values = np.array(grid["success"]), grid["values"]
+        random_series = name == "perturbation"
+        success = np.sort(success)[::-1] if random_series else success
+        image = axes.imshow(
+            success[None], extent=(0, 1, y + 0.42, y - 0.42), aspect="auto", cmap=COLOURS,
+            vmin=0, vmax=1, interpolation="nearest",
+        )  # fmt: skip
+        ends = (
+            ("", f"{len(values)} series")
+            if random_series
+            else (f"{values[0]:.3g}", f"{values[-1]:.3g}")
+        )
+        small = {"va": "center", "fontsize": 9, "color": PALETTE["muted"]}
+        axes.text(-0.015, y, ends[0], ha="right", **small)
+        axes.text(1.015, y, ends[1], ha="left", **small)
+    axes.set_xlim(-margin, 1 + 1.1 * margin)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.set_xticks([])
+    labels = [_label(name) for name, _ in rows]
+    axes.set_yticks(range(len(rows)), labels if first else [""] * len(rows))
+    axes.spines[:].set_visible(False)
+    axes.tick_params(length=0)
+    axes.grid(False)
+    return image
+
+
+def _label(name: str) -> str:
+    kind = VARIATIONS[name]
+    if name == "perturbation":
+        return "perturbations"
+    return f"{kind.title} [{kind.unit}]" if kind.unit else kind.title
+
+
+def _success_bar(figure: Figure, image) -> None:
+    bar = figure.colorbar(image, ax=figure.axes, location="bottom", shrink=0.6, aspect=40, pad=0.02)
+    bar.set_label("fraction of runs that end upright")
+
+
+@styled
+def robustness_figure(results: Sequence[dict[str, Any]]) -> Figure:
+    """Scores and success along every grid, a column for each result (one robot or both).
+
+    ``results`` are ``Report.as_dict()`` with the name of the ``robot`` added.
+    """
+    figure = Figure(figsize=(3.2 + 4.4 * len(results), 9), layout="constrained")
+    grid = figure.add_gridspec(2, len(results), height_ratios=[1, 2.2])
+    for column, result in enumerate(results):
+        _bars(figure.add_subplot(grid[0, column]), result, first=column == 0)
+        axes = figure.add_subplot(grid[1, column])
+        image = _strips(axes, result, first=column == 0)
+    _success_bar(figure, image)
+    return figure
+
+
+@styled
+def strips_figure(result: dict[str, Any]) -> Figure:
+    """Success along every grid of one result, no wider than a phone."""
+    figure = Figure(figsize=(4.4, 6), layout="constrained")
+    _success_bar(figure, _strips(figure.add_subplot(), result, first=True, margin=0.38))
+    return figure
+
+
+@styled
+def map_figure(result: dict[str, Any]) -> Figure:
+    """Success over two imperfections: ``result["map"]`` of the robustness command."""
+    (x_name, x), (y_name, y) = result["map"]["values"].items()
+    figure = Figure(figsize=(5.6, 4.6), layout="constrained")
+    axes = figure.add_subplot()
+    axes.grid(False)
+    success = np.array(result["map"]["success"]).T
+    image = axes.pcolormesh(x, y, success, cmap=COLOURS, vmin=0, vmax=1, shading="nearest")
+    axes.set_xlabel(_label(x_name))
+    axes.set_ylabel(_label(y_name))
+    axes.set_title(f"{result['robot']}: success over two imperfections")
+    figure.colorbar(image, ax=axes, label="fraction of runs that end upright")
+    return figure
+
+
+def _table(result: dict[str, Any]) -> str:
+    """The grids as CSV, a row for every value."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    scored = any(
+        "performance" in g for c in result["criteria"].values() for g in c["grids"].values()
+    )
+    writer.writerow(
+        ["robot", "criterion", "imperfection", "unit", "value", "success"]
+        + ["performance"] * scored
+    )
+    for criterion, found in result["criteria"].items():
+        for name, grid in found["grids"].items():
+            columns = [grid["values"], grid["success"], *([grid["performance"]] if scored else [])]
+            for value, *numbers in zip(*columns, strict=True):
+                unit = VARIATIONS[name].unit
+                writer.writerow([result["robot"], criterion, name, unit, value, *numbers])
+    return text.getvalue()
+
+
+def write_robustness(result: dict[str, Any], folder: Path) -> list[Path]:
+    """Write picture, CSV and JSON of a result; with the other robot's JSON there, both.
+
+    Returns the paths written: ``ROBOT.json``, ``ROBOT.csv``, ``robustness.png`` (a column for
+    each robot found in the folder), and ``ROBOT_map.png`` if there is a map.
+    """
+    robot = result["robot"]
+    written = [folder / f"{robot}.json", folder / f"{robot}.csv", folder / "robustness.png"]
+    write_atomically(written[0], to_json(result, indent=2) + "\n")
+    write_atomically(written[1], _table(result))
+    found = [folder / f"{name}.json" for name in ("acrobot", "pendubot")]
+    both = [json.loads(path.read_text()) for path in found if path.exists()]
+    save(robustness_figure(both), written[2])
+    if "map" in result:
+        written.append(folder / f"{robot}_map.png")
+        save(map_figure(json.loads(written[0].read_text())), written[-1])
+    return written

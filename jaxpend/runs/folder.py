@@ -1,0 +1,252 @@
+"""Configurations in files and run folders on disk."""
+
+import contextlib
+import dataclasses
+import fcntl
+import json
+import os
+import time
+import weakref
+from collections.abc import Sequence
+from importlib import resources
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import yaml
+
+from .. import __version__
+from . import tensorboard
+from ..errors import JaxpendError
+from ..files import to_json, write_atomically
+
+if TYPE_CHECKING:
+    from ..controller import Controller
+
+__all__ = ["RunFolder", "from_mapping", "load_config", "to_mapping"]
+
+T = TypeVar("T")
+
+
+def to_mapping(config: Any) -> dict:
+    """A configuration dataclass as plain nested dicts and lists, as YAML and JSON have them.
+
+    Infinities become text, since JSON has no number for them; ``from_mapping`` reads it back.
+    """
+    return json.loads(json.dumps(dataclasses.asdict(config)), parse_constant=str)
+
+
+def from_mapping(default: T, values: Any, where: str) -> T:
+    """``default`` with the fields named in a nested mapping replaced.
+
+    Raises:
+        JaxpendError: an unknown field, or a value of the wrong type; ``where`` names the source.
+    """
+    if not isinstance(values, dict):
+        raise JaxpendError(f"{where}: expected fields of {type(default).__name__}")
+    known = {f.name: getattr(default, f.name) for f in dataclasses.fields(default)}
+    changes = {}
+    for name, value in values.items():
+        if name not in known:
+            raise JaxpendError(f"{where}: unknown field {name!r}; known: {', '.join(known)}")
+        changes[name] = _converted(known[name], value, f"{where}: {name}")
+    return dataclasses.replace(default, **changes)
+
+
+def _converted(old: Any, value: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(old):
+        return from_mapping(old, value, where)
+    if isinstance(old, tuple) and isinstance(value, list):
+        return tuple(value)
+    if isinstance(old, float) and isinstance(value, int | str) and not isinstance(value, bool):
+        # YAML takes 1e-3 for text, and the infinities of ``to_mapping`` are text.
+        with contextlib.suppress(ValueError):
+            return float(value)
+    if old is not None and type(value) is not type(old):
+        raise JaxpendError(f"{where}: {value!r} is not {type(old).__name__}")
+    return value
+
+
+def load_config(default: T, path: str | Path, also: Sequence[str] = ()) -> T:
+    """``default`` with what a YAML file says; sections in ``also`` may be there without a field.
+
+    ``path`` may be the name of a recipe that ships with the package: acrobot, pendubot or plain.
+
+    Raises:
+        JaxpendError: the file cannot be read, or names an unknown field or a bad value.
+    """
+    shipped = resources.files("jaxpend").joinpath(f"recipes/{path}.yaml")
+    file = shipped if shipped.is_file() else Path(path)
+    try:
+        values = yaml.safe_load(file.read_text())
+    except FileNotFoundError:
+        raise JaxpendError(f"there is no configuration file {path}") from None
+    except (UnicodeDecodeError, yaml.YAMLError):
+        raise JaxpendError(f"{path} is not valid YAML") from None
+    values = {} if values is None else values
+    if isinstance(values, dict):
+        values = {k: v for k, v in values.items() if k not in also or hasattr(default, k)}
+    return from_mapping(default, values, str(path))
+
+
+def differing_field(stored: Any, given: Any, ignored: Sequence[str] = ()) -> str | None:
+    """The first field, dotted, in which two configurations as plain dicts differ; None: in none."""
+    if not isinstance(stored, dict) or not isinstance(given, dict):
+        return None if stored == given else ""
+    for name in {**given, **stored}:
+        if name in ignored:
+            continue
+        inner = differing_field(stored.get(name), given.get(name))
+        if inner is not None:
+            return f"{name}.{inner}".rstrip(".")
+    return None
+
+
+def _field(values: Any, dotted: str) -> Any:
+    for name in dotted.split("."):
+        values = values.get(name) if isinstance(values, dict) else None
+    return values
+
+
+# Where a run is, and how it is kept, may change when it goes on; what it computes may not.
+MAY_DIFFER = (
+    "run", "runs", "seeds", "vmap", "checkpoint", "on_divergence", "max_rollbacks", "tensorboard",
+)  # fmt: skip
+
+
+class RunFolder:
+    """Where a run leaves its configuration, metrics, policies and result.
+
+    ``config.json``, ``run.json`` (version and command), ``metrics.jsonl`` (one row an evaluation),
+    ``*.npz`` policies, ``checkpoints`` while it is not finished and, at the end, ``result.json``.
+    All but the metrics are written atomically.
+
+    A new folder is made; one with a run of the same configuration is taken up again. As long as
+    this object is open, no other process can open a run in the folder that is not finished.
+
+    Raises:
+        JaxpendError: there is a run of another configuration or version, or another process
+            works on it. Nothing in the folder has changed then.
+    """
+
+    def __init__(self, path: str | Path, config: Any, command: str):
+        self.path, self.command = Path(path), command
+        self._tensorboard = getattr(config, "tensorboard", False)
+        self._events: tensorboard.Events | None = None
+        if self._tensorboard:
+            tensorboard.require()
+        self.config, self.started = to_mapping(config), time.perf_counter()
+        self._close = lambda: None
+        self._check()
+        if self.result is None:
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock()
+            self._check()  # again: another process may have made it meanwhile
+            for path in self.path.glob(".*.[0-9]*"):  # of a process killed in write_atomically
+                path.unlink()
+        if not (self.path / "config.json").exists():
+            made_by = {"version": __version__, "jax": version("jax"), "command": command}
+            self.write_json("run.json", made_by)
+            self.write_json("config.json", self.config)  # last: it says that a run is here
+
+    def _check(self) -> None:
+        if not (self.path / "config.json").exists():
+            return
+        instead = "choose another name or remove the folder"
+        stored = self._read("run.json").get("version", "(unknown version)")
+        if stored != __version__:
+            text = f"{self.path} holds a run of jaxpend {stored}, this is {__version__}; {instead}"
+            raise JaxpendError(text)
+        stored = self._read("config.json")
+        field = differing_field(stored, self.config, MAY_DIFFER)
+        if field is not None:
+            there, here = to_json(_field(stored, field)), to_json(_field(self.config, field))
+            text = f"{self.path} holds a run with {field} {there}, not {here}; {instead}"
+            raise JaxpendError(text)
+
+    def _read(self, name: str) -> dict:
+        try:
+            value = json.loads((self.path / name).read_text())
+        except FileNotFoundError:
+            return {}
+        except ValueError:
+            value = None
+        if not isinstance(value, dict):
+            text = f"{self.path / name} is damaged; choose another name or remove the folder"
+            raise JaxpendError(text)
+        return value
+
+    def _lock(self) -> None:
+        # The system releases it when the process ends, however it ends.
+        descriptor = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+        self._close = weakref.finalize(self, os.close, descriptor)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            owner = os.read(descriptor, 20).decode() or "unknown"
+            self.close()
+            text = f"another process ({owner}) is working on {self.path}"
+            raise JaxpendError(f"{text}; wait for it or choose another name") from None
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, str(os.getpid()).encode())
+
+    def close(self) -> None:
+        """Let other processes have the folder."""
+        self._close()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        self.close()
+
+    @property
+    def result(self) -> dict | None:
+        """What ``result.json`` says; None: the run is not finished."""
+        return self._read("result.json") or None
+
+    @property
+    def seconds(self) -> float:
+        """Time spent on the run so far, in all processes that worked on it."""
+        return round(time.perf_counter() - self.started, 2)
+
+    def rewind(self, metrics_bytes: int = 0, seconds: float = 0.0) -> None:
+        """Go back to when the metrics were this long, after so much time."""
+        self.started = time.perf_counter() - seconds
+        if (self.path / "metrics.jsonl").exists():
+            os.truncate(self.path / "metrics.jsonl", metrics_bytes)
+
+    @property
+    def metrics_bytes(self) -> int:
+        """Length of the metrics on disk."""
+        path = self.path / "metrics.jsonl"
+        return path.stat().st_size if path.exists() else 0
+
+    def write_json(self, name: str, value: Any) -> None:
+        """Write a JSON file."""
+        write_atomically(self.path / name, to_json(value, indent=2) + "\n")
+
+    def log(self, stage: str, **values: Any) -> None:
+        """Append one row of metrics, the whole of it or nothing."""
+        row = {"stage": stage, "seconds": self.seconds}
+        row |= {k: v if isinstance(v, int | str) else float(v) for k, v in values.items()}
+        before = self.metrics_bytes
+        try:
+            with (self.path / "metrics.jsonl").open("a") as file:
+                file.write(to_json(row) + "\n")
+        except OSError:  # a full disk takes the beginning of a row
+            if self.metrics_bytes > before:
+                os.truncate(self.path / "metrics.jsonl", before)
+            raise
+        if self._events is not None:
+            self._events.add(row)
+        elif self._tensorboard:
+            self._events = tensorboard.Events(self.path)  # of all rows, this one too
+
+    def save(self, name: str, policy: "Controller", **provenance: Any) -> Path:
+        """Write a policy or controller file with the command and configuration that made it."""
+        from ..controllers.files import save_controller  # loads jax; configurations do without
+
+        made_by = {"command": self.command, "version": __version__, "config": self.config}
+        save_controller(self.path / name, policy, self.config["robot"], provenance | made_by)
+        return self.path / name

@@ -1,0 +1,58 @@
+"""The metrics of a run as TensorBoard events; needs the package tensorboardX."""
+
+import contextlib
+import json
+import shutil
+import time
+import weakref
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..errors import JaxpendError
+
+__all__ = ["Events", "require"]
+
+COLUMNS = ("env_steps", "generation", "updates")  # the first that a row has counts its steps
+
+
+def require() -> None:
+    """Raise ``JaxpendError`` if the package is not installed."""
+    try:
+        import tensorboardX  # noqa: F401
+    except ImportError:
+        text = "tensorboard needs the package tensorboardX: pip install 'jaxpend[tensorboard]'"
+        raise JaxpendError(text) from None
+
+
+class Events:
+    """Scalars STAGE/NAME over the steps of the stage, in ``RUN/tensorboard``.
+
+    They are made anew from the metrics on disk, so that a run that goes on from a checkpoint has no
+    row twice. Every row is on disk when ``add`` returns (``SummaryWriter`` would leave that to a
+    thread and lose the last ones).
+    """
+
+    def __init__(self, run: Path):
+        from tensorboardX.event_file_writer import EventsWriter
+
+        shutil.rmtree(run / "tensorboard", ignore_errors=True)
+        (run / "tensorboard").mkdir()
+        self._writer = EventsWriter(str(run / "tensorboard" / "events"))
+        weakref.finalize(self, self._writer.close)
+        for line in (run / "metrics.jsonl").read_text().splitlines():
+            with contextlib.suppress(ValueError):
+                self.add(json.loads(line))
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Write one row of metrics; what is not a number is left out."""
+        from tensorboardX.proto.event_pb2 import Event
+        from tensorboardX.summary import scalar
+
+        column = next(name for name in COLUMNS if name in row)
+        for name, value in row.items():
+            if isinstance(value, int | float) and name not in ("seconds", column):
+                summary = scalar(f"{row['stage']}/{name}", value)
+                event = Event(wall_time=time.time(), step=row[column], summary=summary)
+                self._writer.write_event(event)
+        self._writer.flush()

@@ -1,0 +1,104 @@
+"""Flax networks of SAC: a tanh-Gaussian actor and twin critics."""
+
+from collections.abc import Sequence
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from ..controllers.policy import ACTIVATIONS, Policy
+from ..env import EnvConfig
+
+__all__ = ["Actor", "TwinCritic", "constant_log_std", "sample_action", "to_policy"]
+
+LOG_STD_RANGE = (-10.0, 2.0)
+
+
+class Trunk(nn.Module):
+    """Dense layers, each followed by an optional layer normalisation and the activation."""
+
+    hidden: Sequence[int]
+    activation: str
+    layer_norm: bool = False
+
+    @nn.compact
+    def __call__(self, h: jax.Array) -> jax.Array:
+        for width in self.hidden:
+            h = nn.Dense(width)(h)
+            h = nn.LayerNorm()(h) if self.layer_norm else h
+            h = ACTIVATIONS[self.activation](h)
+        return h
+
+
+class Actor(nn.Module):
+    """Mean and log standard deviation of the action before the tanh.
+
+    It sees the first ``seen`` entries of the observation, not what is for the critics alone, such
+    as the previous action: the reward depends on it, but a policy that feeds its last action back
+    acts differently at 500 Hz than at the 100 Hz it was trained at.
+    """
+
+    hidden: Sequence[int]
+    activation: str
+    seen: int
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        h = Trunk(self.hidden, self.activation)(obs[..., : self.seen])
+        mean = nn.Dense(1, name="mean")(h)
+        log_std = nn.Dense(1, name="log_std")(h)
+        return mean, jnp.clip(log_std, *LOG_STD_RANGE)
+
+
+class TwinCritic(nn.Module):
+    """Two independent action values, shape (..., 2)."""
+
+    hidden: Sequence[int]
+    activation: str
+    layer_norm: bool
+
+    @nn.compact
+    def __call__(self, obs: jax.Array, action: jax.Array) -> jax.Array:
+        inputs = jnp.concatenate([obs, action], axis=-1)
+        values = []
+        for _ in range(2):
+            h = Trunk(self.hidden, self.activation, self.layer_norm)(inputs)
+            values.append(nn.Dense(1)(h))
+        return jnp.concatenate(values, axis=-1)
+
+
+def sample_action(mean, log_std, key) -> tuple[jax.Array, jax.Array]:
+    """Sample tanh(N(mean, std)); returns action (..., 1) and log-probability (...,).
+
+    The log-probability is computed from the sample before the tanh, with
+    ``log(1 - tanh(v)^2) = 2 (log 2 - v - softplus(-2 v))`` (Haarnoja et al., 2018, appendix C).
+    ``key`` is consumed.
+    """
+    noise = jax.random.normal(key, mean.shape, mean.dtype)
+    v = mean + jnp.exp(log_std) * noise
+    log_prob = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
+    log_prob = log_prob - 2 * (jnp.log(2.0) - v - jax.nn.softplus(-2 * v))
+    return jnp.tanh(v), jnp.sum(log_prob, axis=-1)
+
+
+def constant_log_std(actor_params: dict, log_std: float) -> dict:
+    """Actor parameters with the same log standard deviation in every state."""
+    params = dict(actor_params["params"])
+    head = jax.tree.map(jnp.zeros_like, params["log_std"])
+    params["log_std"] = head | {"bias": head["bias"] + log_std}
+    return {"params": params}
+
+
+def to_policy(actor_params: dict, actor: Actor, env: EnvConfig) -> Policy:
+    """The greedy policy of an actor as a ``Controller`` of plain arrays."""
+    params = actor_params["params"]
+    trunk = params["Trunk_0"]
+    dense = [trunk[f"Dense_{i}"] for i in range(len(actor.hidden))] + [params["mean"]]
+    return Policy(
+        layers=tuple((d["kernel"], d["bias"]) for d in dense),
+        torque_limit=jnp.asarray(env.torque_limit, jnp.float32),
+        robot=env.robot,
+        observation=env.observation,
+        activation=actor.activation,
+        control_dt=env.dt,
+    )

@@ -1,0 +1,1 @@
+"""Trajectory optimisation: iLQR, the swing-up problem, the search, and reference trajectories."""

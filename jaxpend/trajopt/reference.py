@@ -1,0 +1,98 @@
+"""An optimised swing-up to follow, and its file: plain arrays and a JSON header."""
+
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..arrays import read_arrays, write_arrays
+from ..designs import ROBOTS, active_joint
+from ..errors import JaxpendError, choose
+from ..pytree import pytree, static
+
+__all__ = ["Reference", "load_reference", "save_reference"]
+
+FORMAT = 1
+
+
+@pytree
+class Reference:
+    """A swing-up of N steps from hanging to upright, with the feedback that iLQR found for it."""
+
+    x: jax.Array  # (N + 1, 4) states
+    u: jax.Array  # (N,) N m, torque of the driven joint over step k
+    gain: jax.Array  # (N, 5) of (state, last torque): u + gain . (deviation, last - u_{k-1})
+    robot: str = static(default="pendubot")
+    dt: float = static(default=0.002)  # s
+
+    @property
+    def steps(self) -> int:
+        """N."""
+        return self.u.shape[0]
+
+    @property
+    def goal(self) -> jax.Array:
+        """Upright, (4,), on the turn of theta1 and theta2 where the swing-up ends."""
+        turn = 2 * jnp.pi
+        upright = jnp.array([jnp.pi, 0.0], self.x.dtype)
+        angles = upright + turn * jnp.round((self.x[-1, :2] - upright) / turn)
+        return jnp.concatenate([angles, jnp.zeros(2, self.x.dtype)])
+
+    def index(self, t: jax.Array) -> jax.Array:
+        """Step that time ``t`` (s) falls on, not clipped to the horizon; int."""
+        return jnp.round(t / self.dt).astype(int)
+
+    def both(self, torque: jax.Array) -> jax.Array:
+        """A torque of the driven joint () as torques of both joints (2,)."""
+        return jnp.where(np.arange(2) == active_joint(self.robot), torque, jnp.zeros_like(torque))
+
+
+def save_reference(path: str | Path, reference: Reference, provenance: dict[str, Any]) -> None:
+    """Write a trajectory file (.npz without pickle), atomically: float32, the torques float64."""
+    header = {
+        "format": FORMAT,
+        "kind": "swing-up",
+        "robot": reference.robot,
+        "dt": reference.dt,
+        "provenance": provenance,
+    }
+    arrays = {"x": np.asarray(reference.x, "f4"), "gain": np.asarray(reference.gain, "f4")}
+    write_arrays(path, header, arrays | {"u": np.asarray(reference.u, "f8")})
+
+
+def _locate(robot_or_path: str | Path) -> Path:
+    if str(robot_or_path) not in ROBOTS:
+        return Path(robot_or_path)
+    return Path(str(resources.files("jaxpend").joinpath(f"trajectories/{robot_or_path}.npz")))
+
+
+def load_reference(robot_or_path: str | Path, *, robot: str | None = None) -> Reference:
+    """Load a trajectory file, or by "acrobot" / "pendubot" the one that ships with the package.
+
+    The arrays have jax's default float type at the time of the call.
+
+    Raises:
+        JaxpendError: no such file, not a trajectory file, or one for the other robot.
+    """
+    path = _locate(robot_or_path)
+    header, arrays = read_arrays(path, "trajectory")
+    if header.get("kind") != "swing-up" or header.get("format") != FORMAT:
+        raise JaxpendError(f"{path} is not a swing-up trajectory of format {FORMAT}")
+    try:
+        steps = arrays["u"].shape[0]
+        shapes = {name: arrays[name].shape for name in ("x", "u", "gain")}
+        name, dt = choose("robot", header["robot"], ROBOTS), float(header["dt"])
+    except (KeyError, IndexError, TypeError) as error:
+        raise JaxpendError(f"{path} lacks a part of a trajectory: {error}") from None
+    if shapes != {"x": (steps + 1, 4), "u": (steps,), "gain": (steps, 5)} or steps < 1:
+        raise JaxpendError(f"{path}: the arrays do not have the shapes of a trajectory: {shapes}")
+    if not (all(np.isfinite(arrays[n]).all() for n in shapes) and dt > 0):
+        raise JaxpendError(f"{path}: the trajectory holds values that are not finite")
+    if robot is not None and name != choose("robot", robot, ROBOTS):
+        raise JaxpendError(f"{path} is a trajectory for the {name}, not for the {robot}")
+    dtype = jnp.result_type(float)
+    x, u, gain = (jnp.asarray(arrays[n], dtype) for n in ("x", "u", "gain"))
+    return Reference(x, u, gain, robot=name, dt=dt)

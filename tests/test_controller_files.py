@@ -1,0 +1,155 @@
+"""Controller files: whatever the controller, it comes back whole, and a file cannot run code."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import refused, rewrite
+
+from jaxpend import JaxpendError, Policy, designs, leaderboard, load_policy, save_policy
+from jaxpend.cli import commands
+from jaxpend.controller import Memoryless
+from jaxpend.controllers import Feedback, Reference, load_controller, lqr, save_controller
+from jaxpend.controllers.catalogue import CATALOGUE, build, find_controller
+from jaxpend.controllers.files import classes_of
+from jaxpend.controllers.hybrid import with_lqr
+from jaxpend.controllers.policy import network_in
+from jaxpend.pytree import pytree, static
+from jaxpend.score import official
+
+PLANT = designs.competition("pendubot")
+
+
+@pytree
+class Own(Memoryless):
+    """A user's own controller, with parts of the package's."""
+
+    parts: tuple
+    wheels: int = static(default=4)
+
+    def __call__(self, carry, t, x):
+        return carry, self.parts[0](None, t, x)[1] / self.wheels
+
+
+OWN = Own((lqr(PLANT, "pendubot"), None))
+
+
+def same(a, b):
+    """The same controller, to the bit."""
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+@pytest.mark.parametrize("name", [n for n in CATALOGUE if not n.startswith("mpc")])
+def test_every_known_controller_comes_back_whole(tmp_path, name):
+    made, path = build(name, PLANT, "pendubot"), tmp_path / "file.npz"
+    save_controller(path, made, "pendubot", {"seed": 7})
+    same(load_controller(path, robot="pendubot"), made)
+    with np.load(path, allow_pickle=False) as arrays:
+        assert json.loads(str(arrays["header"]))["provenance"] == {"seed": 7}
+    # In the precision of the one who loads it; a network alone is float32 wherever it is.
+    if not isinstance(made, Policy):
+        with jax.enable_x64(True):
+            leaves = jax.tree.leaves(load_controller(path))
+            assert {str(leaf.dtype) for leaf in leaves} == {"float64"}
+
+
+def test_policies_are_policy_files(tmp_path):
+    path, policy = tmp_path / "policy.npz", load_policy("acrobot")
+    save_controller(path, policy, "acrobot")
+    same(load_policy(path), policy)
+    same(load_controller("acrobot"), policy)
+    hybrid = with_lqr(network_in(policy), PLANT, "acrobot")
+    for save in (
+        lambda: save_controller(path, hybrid, "acrobot"),
+        lambda: save_policy(path, hybrid),
+    ):
+        path.unlink()
+        save()
+        same(load_policy(path, robot="acrobot"), hybrid)
+    same(network_in(load_policy(path)), network_in(policy))
+    with pytest.raises(JaxpendError, match="holds 0 neural networks; one is needed"):
+        network_in(lqr(PLANT, "acrobot"), path)
+
+
+def test_a_users_own_class_must_be_given(tmp_path):
+    path = tmp_path / "own.npz"
+    save_controller(path, OWN, "pendubot")
+    with pytest.raises(JaxpendError, match=r"unknown class of a controller 'Own'; known: .*TVLQR"):
+        load_controller(path)
+    assert Own in classes_of(OWN)
+    same(load_controller(path, classes=classes_of(OWN)), OWN)
+
+
+def test_what_a_file_cannot_hold_is_said(tmp_path):
+    with pytest.raises(JaxpendError, match=r"law is <.*; a file can hold arrays, numbers and text"):
+        save_controller(tmp_path / "file.npz", Feedback(lambda t, x: x[:2]), "pendubot")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a, h: h.update(format=99), "has controller format 99"),
+        (lambda a, h: h.update(robot="cartpole"), "unknown robot 'cartpole'"),
+        (lambda a, h: h.update(robot="acrobot"), "for the acrobot, not for the pendubot"),
+        (lambda a, h: h["controller"].update({"class": "Popen"}), "unknown class"),
+        (lambda a, h: h["controller"].update({"class": "Plant"}), "not hold a whole controller"),
+        (lambda a, h: h["controller"]["fields"].pop("goal"), "not hold a whole controller"),
+        (lambda a, h: h.update(controller=3), "not hold a whole controller"),
+        (lambda a, h: a.pop("gain"), "not hold a whole controller: KeyError('gain')"),
+        (lambda a, h: a.update(gain=a["gain"][:, :3]), "not hold a whole controller"),
+        (lambda a, h: a.update(gain=a["gain"] * np.nan), "or holds nan"),
+        (lambda a, h: a.update(gain=a["gain"][:1], torque_limit=a["torque_limit"][:1]), "(2,)"),
+    ],
+)
+def test_damaged_contents_are_one_sentence(tmp_path, change, words):
+    path = tmp_path / "file.npz"
+    save_controller(path, lqr(PLANT, "pendubot"), "pendubot")
+    rewrite(path, change)
+    with refused(words):
+        load_controller(path, robot="pendubot")
+
+
+def test_commands_judge_a_controller_file(tmp_path, capsys):
+    path = tmp_path / "hybrid.npz"
+    layers = ((jnp.zeros((6, 3)), jnp.zeros(3)), (jnp.zeros((3, 1)), jnp.zeros(1)))
+    hybrid = with_lqr(Policy(layers, jnp.asarray(3.0)), PLANT, "pendubot")
+    save_controller(path, hybrid, "pendubot", {"seed": 1})
+    commands.score("pendubot", str(path), json="-")
+    result = json.loads(capsys.readouterr().out)
+    assert result["criteria"] == official(hybrid, "pendubot")["criteria"]
+    assert result["header"]["provenance"] == {"seed": 1}
+    same(find_controller(path, None, PLANT, "pendubot"), hybrid)
+    title, make = leaderboard.chosen("lqr", path, "pendubot")["own_policy"]
+    assert title == "hybrid"
+    same(make(PLANT), hybrid)
+
+
+def test_a_name_and_a_file_together(tmp_path):
+    """A known controller around the file's policy; or the file of one's own classes."""
+    path = tmp_path / "policy.npz"
+    layers = ((jnp.ones((6, 3)), jnp.zeros(3)), (jnp.ones((3, 1)), jnp.zeros(1)))
+    policy = Policy(layers, jnp.asarray(3.0, jnp.float32))
+    save_controller(path, policy, "pendubot")
+    same(find_controller(None, None, PLANT, "pendubot"), load_policy("pendubot"))
+    same(find_controller(None, "pd", PLANT, "pendubot"), build("pd", PLANT, "pendubot"))
+    found = find_controller(path, "policy_lqr", PLANT, "pendubot")
+    same(found, with_lqr(network_in(policy), PLANT, "pendubot"))
+    with pytest.raises(JaxpendError, match=r"pd is not built around a policy; leave out .*policy"):
+        find_controller(path, "pd", PLANT, "pendubot")
+    with pytest.raises(JaxpendError, match=r"unknown controller 'foo'; known: policy, .*tvlqr"):
+        find_controller(None, "foo", PLANT, "pendubot")
+    save_controller(path, OWN, "pendubot")
+    name = f"{__name__}:OWN"
+    same(find_controller(path, name, PLANT, "pendubot"), OWN)
+    assert find_controller(None, name, PLANT, "pendubot") is OWN
+
+
+def test_nominal_alone_is_no_controller(tmp_path):
+    reference = Reference(jnp.zeros((3, 4)), jnp.zeros(2), jnp.zeros((2, 5)))
+    save_controller(tmp_path / "file.npz", reference, "pendubot")
+    with pytest.raises(JaxpendError, match="not hold a whole controller"):
+        load_controller(tmp_path / "file.npz")
