@@ -1,26 +1,110 @@
-"""The published v2 boards of RealAIGym: their rows, and what their columns are called."""
+"""Tasks and boards as values: what is controlled and how it is scored; what is published of it.
 
-__all__ = ["HEADINGS", "PUBLISHED"]
+A ``Task`` is all that a learner may know: environment, SAC, SNES, gradient and trajectory
+optimisation take one. A ``Board`` is a task with the official trials and the published rows; what
+judges takes one. So training cannot touch official keys or grids, and another board is a value.
+"""
 
-# Performance and robustness, as published (arXiv 2409.08938 and the boards).
-PUBLISHED = {
-    "acrobot": {
-        "Evolutionary SAC": (0.524, 0.692),
-        "HistorySAC": (0.655, 0.751),
-        "AR-EAPO": (0.633, 0.727),
-        "TVLQR": (0.504, 0.607),
-        "iLQR MPC": (0.345, 0.343),
-        "iLQR Riccati gains": (0.396, 0.138),
-    },
-    "pendubot": {
-        "Evolutionary SAC": (0.596, 0.796),
-        "HistorySAC": (0.682, 0.770),
-        "AR-EAPO": (0.659, 0.913),
-        "TVLQR": (0.526, 0.767),
-        "iLQR MPC": (0.353, 0.674),
-        "iLQR Riccati gains": (0.536, 0.255),
-    },
-}
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+
+from . import designs
+from .criteria import HEIGHT, Criteria, ScoreV2, criteria
+from .errors import JaxpendError, choose
+from .plant import Plant
+from .robots import ROBOTS, active_joint
+from .scenario import Scenario
+from .variations import sample
+
+if TYPE_CHECKING:
+    from .rollout import Trajectory
+
+__all__ = ["HEADINGS", "V2", "Board", "Task", "board", "v2"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """A robot, its plant, the time grid, and the score of a trajectory; hashable, so static in jit.
+
+    Raises ``JaxpendError`` for an unknown robot, or numbers that are not positive and finite.
+    """
+
+    robot: str  # "acrobot" or "pendubot"
+    parameters: tuple[tuple[str, float], ...]  # of the plant, named as in ``designs.from_dict``
+    torque_limit: float = 6.0  # N m, of the driven joint
+    dt: float = 0.002  # s, control and integration period
+    duration: float = 10.0  # s
+    height: float = HEIGHT  # the line, as a fraction of the stretched height
+    scoring: Callable[[Criteria], jax.Array] = ScoreV2()  # hashable
+
+    def __post_init__(self) -> None:
+        active_joint(self.robot)
+        for name in ("torque_limit", "dt", "duration", "height"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
+
+    @property
+    def plant(self) -> Plant:
+        """The nominal plant, in jax's default float type at the time of the call."""
+        return self.limited(self.torque_limit)
+
+    def limited(self, torque_limit: float) -> Plant:
+        """The nominal plant whose driven joint has another torque limit, N m."""
+        parameters = dict(self.parameters)
+        return designs.from_dict(parameters, robot=self.robot, torque_limit=torque_limit)
+
+    @property
+    def joint(self) -> int:
+        """Index of the driven joint."""
+        return active_joint(self.robot)
+
+    @property
+    def steps(self) -> int:
+        """Steps of ``dt`` in a run."""
+        return round(self.duration / self.dt)
+
+    def sample(self, key: jax.Array, share: float = 1.0) -> Scenario:
+        """A random imperfect scenario around the plant, see ``variations.sample``."""
+        return sample(self.plant, key, share)
+
+    def criteria(self, run: "Trajectory", plant: Plant | None = None) -> Criteria:
+        """The criteria of a trajectory; ``plant`` gives the link lengths, by default the task's."""
+        plant = self.plant if plant is None else plant
+        options = {"height": self.height, "t_final": self.duration}
+        return criteria(run.t, run.x, run.u, plant, **options)
+
+    def score(self, c: Criteria) -> jax.Array:
+        """The score of criteria, of their batch shape."""
+        return self.scoring(c)
+
+    def of(self, parameters: Mapping[str, float]) -> "Task":
+        """The same task on another plant.
+
+        ``parameters`` are as in ``designs.from_dict``; the torque limit stays the task's.
+        """
+        designs.from_dict(parameters, robot=self.robot)
+        values = tuple((name, float(value)) for name, value in parameters.items())
+        return dataclasses.replace(self, parameters=values)
+
+
+@dataclasses.dataclass(frozen=True)
+class Board:
+    """A task with its official trials and the rows that are published."""
+
+    name: str
+    task: Task
+    published: tuple[tuple[str, float, float], ...] = ()  # title, performance, robustness
+
+    @property
+    def robot(self) -> str:
+        """ "acrobot" or "pendubot"."""
+        return self.task.robot
+
+
 # The criteria of the performance score: heading, unit and format.
 HEADINGS = {
     "swingup_time": ("swing-up", "s", ".2f"),
@@ -29,3 +113,33 @@ HEADINGS = {
     "tau_smoothness": ("smoothness", "N m", ".4f"),
     "velocity_cost": ("velocity cost", "rad²/s", ".1f"),
 }
+# Performance and robustness, as published (arXiv 2409.08938 and the boards).
+_PUBLISHED = {
+    "acrobot": (
+        ("Evolutionary SAC", 0.524, 0.692),
+        ("HistorySAC", 0.655, 0.751),
+        ("AR-EAPO", 0.633, 0.727),
+        ("TVLQR", 0.504, 0.607),
+        ("iLQR MPC", 0.345, 0.343),
+        ("iLQR Riccati gains", 0.396, 0.138),
+    ),
+    "pendubot": (
+        ("Evolutionary SAC", 0.596, 0.796),
+        ("HistorySAC", 0.682, 0.770),
+        ("AR-EAPO", 0.659, 0.913),
+        ("TVLQR", 0.526, 0.767),
+        ("iLQR MPC", 0.353, 0.674),
+        ("iLQR Riccati gains", 0.536, 0.255),
+    ),
+}
+V2 = {robot: Board("v2", Task(robot, designs.COMPETITION), _PUBLISHED[robot]) for robot in ROBOTS}
+
+
+def v2(robot: str) -> Board:
+    """The v2 board of a robot. Raises ``JaxpendError`` for an unknown one."""
+    return V2[choose("robot", robot, V2)]
+
+
+def board(robot_or_board: "str | Board") -> Board:
+    """A board itself, or by a robot's name its v2 board."""
+    return robot_or_board if isinstance(robot_or_board, Board) else v2(robot_or_board)

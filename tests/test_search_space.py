@@ -10,6 +10,7 @@ from conftest import assert_close, refused
 
 from jaxpend import Policy, designs
 from jaxpend.controllers import TVLQR, Reference, energy_shaping, lqr, pd, riccati
+from jaxpend.controllers.hybrid import with_lqr
 from jaxpend.controllers.search_space import FACTOR, KNOTS, OVER_TIME, WEIGHT, coordinates, kinds
 from jaxpend.pytree import pytree, static
 

@@ -17,7 +17,16 @@ from ..errors import JaxpendError, choose
 from ..plant import Plant
 from ..robots import ROBOTS, active_joint
 
-__all__ = ["ROBOTS", "active_joint", "available", "competition", "from_dict", "from_file", "load"]
+__all__ = [
+    "COMPETITION",
+    "ROBOTS",
+    "active_joint",
+    "available",
+    "competition",
+    "from_dict",
+    "from_file",
+    "load",
+]
 
 _REQUIRED = ("m1", "m2", "l1", "l2", "r1", "r2", "I1", "I2")
 _OPTIONAL = {
@@ -29,6 +38,12 @@ _POSITIVE = ("m1", "m2", "l1", "l2", "r1", "r2", "I1", "I2", "gr")
 
 def _table() -> dict[str, dict[str, dict[str, float]]]:
     return json.loads(resources.files(__package__).joinpath("models.json").read_text())
+
+
+# The plant of the v2 boards: design C.1 model 1.0 without friction and motor inertia.
+COMPETITION: tuple[tuple[str, float], ...] = tuple(
+    (_table()["C.1"]["1.0"] | dict.fromkeys(("b1", "b2", "cf1", "cf2", "Ir"), 0.0)).items()
+)
 
 
 def available() -> list[str]:
@@ -121,5 +136,4 @@ def competition(robot: str, torque_limit: float = 6.0) -> Plant:
     The passive joint is masked and the driven one limited to ``torque_limit`` N m. The boards
     run it at dt = 0.002 s for 10 s from (0, 0, 0, 0), the defaults of ``rollout``.
     """
-    parameters = _table()["C.1"]["1.0"] | dict.fromkeys(("b1", "b2", "cf1", "cf2", "Ir"), 0.0)
-    return from_dict(parameters, robot=robot, torque_limit=torque_limit)
+    return from_dict(dict(COMPETITION), robot=robot, torque_limit=torque_limit)
