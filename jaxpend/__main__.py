@@ -1,6 +1,6 @@
 """The command ``jaxpend``, also as ``python -m jaxpend``."""
 
-import contextlib
+# Nothing else is imported here: until ``main`` begins, Ctrl-C is a traceback.
 import os
 import signal
 
@@ -28,9 +28,10 @@ def main() -> None:
 
 def _interrupted(signum: int, _frame: object) -> None:
     show_cursor = b"\r\x1b[?25h" if os.isatty(2) else b""
-    with contextlib.suppress(OSError):  # not print: this may have interrupted one
-        os.write(2, show_cursor + b"jaxpend: interrupted\n")
-    os._exit(128 + signum)
+    try:
+        os.write(2, show_cursor + b"jaxpend: interrupted\n")  # print may be what is interrupted
+    finally:
+        os._exit(128 + signum)
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ class Reward(Checked):
     phi2: NotNegative = 0.15  # change of the action, below
     eta: NotNegative = 0.02  # s^2, joint velocities squared, below
     # A step earns at least this; a spinning arm earns -100 and less.
-    floor: Annotated[float, Bounds(below=math.inf, infinite=True)] = -math.inf
+    floor: Annotated[float, Bounds(most=0, infinite=True)] = -math.inf
 
 
 @dataclasses.dataclass(frozen=True)

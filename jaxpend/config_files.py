@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -80,7 +81,7 @@ def load_config(default: T, path: str | Path, also: Sequence[str] = ()) -> T:
     file = Path(path)
     if str(path) in recipes():
         file = resources.files("jaxpend").joinpath(f"recipes/{path}.yaml")
-    elif not file.exists():
+    elif not os.path.exists(path):
         known = ", ".join(recipes())
         raise JaxpendError(f"there is no configuration file {path}, and no such recipe: {known}")
     values = read_yaml(file)

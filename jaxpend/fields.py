@@ -118,7 +118,7 @@ def checked(hint: Any, value: Any, name: str, *, text: bool = False) -> Any:
         return _fitted(hint, value, text)
     except _Unfit as unfit:
         shown, must = unfit.args
-        if text and isinstance(shown, list) and all(isinstance(part, str) for part in shown):
+        if text and shown and isinstance(shown, list) and all(type(v) is str for v in shown):
             shown = " ".join(shown)
         raise JaxpendError(f"{name} is {reprlib.repr(shown)}; it must {must}") from None
 

@@ -17,6 +17,8 @@ class _Console(Console):
 
 # Progress and tables go to standard error, so that standard output stays machine-readable.
 console = _Console(stderr=True)
+if console.width < 40:  # no room for the tables: let the terminal break their lines
+    console.width = 80
 
 
 class LiveProgress:

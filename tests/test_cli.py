@@ -3,9 +3,11 @@
 import json
 import math
 import os
+import resource
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Literal
 
@@ -353,3 +355,173 @@ def test_flags_of_a_section_are_yes_or_no():
         assert configured(*arguments).sac.critic_layer_norm
     for arguments in ([], ["--sac.no-critic-layer-norm"], ["--sac.critic-layer-norm=off"]):
         assert not configured(*arguments).sac.critic_layer_norm
+
+
+# --- the process around a command ----------------------------------------------------------
+
+
+def command(line, stdout=subprocess.PIPE, **environment):
+    """A command in a shell, as a process of its own; ``jaxpend`` is this package's."""
+    line = line.replace("jaxpend", f"{sys.executable} -m jaxpend", 1)
+    return subprocess.run(
+        ["bash", "-c", line], stdout=stdout, stderr=subprocess.PIPE, text=True, timeout=120,
+        env=os.environ | environment, pass_fds=[stdout] if stdout > 2 else (),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """A folder with a run in it."""
+    (tmp_path / "runs" / "mine").mkdir(parents=True)
+    (tmp_path / "runs" / "mine" / "config.json").write_text('{"robot": "acrobot", "seed": 1}')
+    return tmp_path / "runs"
+
+
+@pytest.mark.parametrize(
+    ("line", "code"),
+    [("--help", 141), ("train -H", 141), ("runs {} --json -", 141), ("runs {} 2>&1", 141),
+     ("runs {}/none 2>&1", 2)],
+)  # fmt: skip
+def test_nobody_reads_the_output_any_more(runs, line, code):
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = command(f"jaxpend {line.format(runs)}".replace("2>&1", f"2>&{writer}"), stdout=writer)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (code, "")
+
+
+def test_output_that_is_closed_or_full(runs):
+    done = command(f"jaxpend runs {runs} --json - >&-")
+    words = "jaxpend runs: standard output is closed; name a file instead of -\n"
+    assert (done.returncode, done.stderr) == (2, words)
+    assert command(f"jaxpend runs {runs} >&- 2>&-").returncode == 0
+    assert command(f"jaxpend runs {runs}/none >&- 2>&-").returncode == 2
+    done = command(f"jaxpend runs {runs} --json - >/dev/full")
+    words = "jaxpend runs: cannot use: No space left on device\n"
+    assert (done.returncode, done.stderr) == (2, words)
+
+
+@pytest.mark.parametrize("columns", ["0", "1", "-5", "wide"])
+def test_a_terminal_with_no_room_is_written_beyond(runs, columns):
+    for line in ("--help", "train --help", "robustness -H"):
+        done = command(f"jaxpend {line}", COLUMNS=columns)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert "--config" in done.stdout or "--map" in done.stdout
+    done = command(f"jaxpend runs {runs}", COLUMNS=columns)
+    assert done.returncode == 0
+    assert "mine" in done.stderr
+
+
+def test_a_platform_that_is_not_there_is_said():
+    for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
+        done = command("jaxpend score", **{name: "nonsense"})
+        assert done.returncode == 2
+        start = f"jaxpend score: {name} is 'nonsense', which jax cannot use here: "
+        assert done.stderr.startswith(start)
+        assert done.stderr.count("\n") == 1
+
+
+INTERRUPTED = """
+import sys
+from jaxpend.__main__ import main
+print(flush=True)
+main()
+"""
+
+
+@pytest.mark.parametrize("line", ["score", "train --runs {}"])
+@pytest.mark.parametrize("seconds", [0.05, 0.1, 0.2, 0.3, 0.5, 0.8])
+def test_ctrl_c_in_the_first_second_is_one_line(tmp_path, line, seconds):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # children inherit "ignored"
+    pipe = subprocess.PIPE
+    arguments = [sys.executable, "-c", INTERRUPTED, *line.format(tmp_path).split()]
+    with subprocess.Popen(arguments, stdout=pipe, stderr=pipe, text=True) as process:
+        signal.signal(signal.SIGINT, before)
+        process.stdout.readline()
+        time.sleep(seconds)
+        process.send_signal(signal.SIGINT)
+        assert process.stderr.read() == "jaxpend: interrupted\n"
+    assert process.returncode == 130
+
+
+def test_help_takes_little_time():
+    def used():
+        usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return usage.ru_utime + usage.ru_stime
+
+    seconds = []
+    for line in ("--help", "train --help", "train --help"):
+        before = used()
+        assert command(f"jaxpend {line}").returncode == 0
+        seconds.append(used() - before)
+    assert min(seconds) < 0.3
+
+
+def test_help_shows_choices_and_with_capital_h_what_fields_mean():
+    short, full = (command(f"jaxpend train {h}").stdout for h in ("--help", "-H"))
+    for text in (short, full):
+        assert "--on-divergence stop|rollback (default: stop)" in text
+        assert "--snes.strategy snes|sep_cma_es|lm_ma_es|open_es (default: snes)" in text
+        assert "--sac.actor-hidden INTEGER ... (default: 128 128)" in text
+        assert "--sac.mirror, --sac.no-mirror (default: no)" in text
+    about = ("gradient updates per vector step", "Polyak averaging of the target critics")
+    assert all(words in full and words not in short for words in about)
+    assert "\n\nsac.env: The learning environment.\n" in short
+
+
+# --- what the commands refuse before they compute ------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("robustness --keys 0", "--keys is 0; it must be positive"),
+        ("robustness --chunk 0", "--chunk is 0; it must be positive"),
+        ("robustness --worst -5", "--worst is -5; it must not be negative"),
+        ("robustness --seed -1", "--seed is -1; it must not be negative"),
+        ("robustness --seed 4294967296", "--seed is 4294967296; it must be at most 2,147,483,647"),
+        ("robustness --torque-limit nan", "--torque-limit is nan; it must be positive"),
+        ("robustness --torque-limit inf", "--torque-limit is inf; it must be finite"),
+        ("robustness --map m2", "--map is 'm2'; it must be 2 values, each a text"),
+        ("robustness --robot tricycle", "--robot is 'tricycle'; it must be acrobot or pendubot"),
+        ("robustness --out {file}", "cannot write into {file}: {file} is not a folder"),
+        ("robustness --out {file}/a/b", "cannot write into {file}/a/b: {file} is not a folder"),
+        ("robustness --json {folder}", "cannot write {folder}: it is a folder"),
+        ("leaderboard --out {folder}", "cannot write {folder}: it is a folder"),
+        ("leaderboard --keys 0", "--keys is 0; it must be positive"),
+        ("optimise", "--robot is missing; see jaxpend optimise --help"),
+        ("optimise --robot acrobot --out {file}/a", "cannot write into {file}: {file} is not a "
+         "folder"),
+        ("optimise --robot acrobot --search.horizons", "--search.horizons needs a value: one or "
+         "more values, each a number"),
+        ("optimise --robot acrobot --search.starts -1", "--search.starts is -1; it must be "
+         "positive"),
+        ("report", "RUN is missing; see jaxpend report --help"),
+        ("report acrobot --out {file}", "cannot write into {file}: {file} is not a folder"),
+        ("score --json {file}/a", "cannot write into {file}: {file} is not a folder"),
+        ("runs {folder} --json {folder}", "cannot write {folder}: it is a folder"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused_before_anything_runs(monkeypatch, capsys, tmp_path, line, words):
+    (tmp_path / "file").touch()
+    names = {"file": tmp_path / "file", "folder": tmp_path}
+    line = line.format(**names)
+    assert run(monkeypatch, capsys, line, cli.main) == (
+        2, "", f"jaxpend {line.split()[0]}: {words.format(**names)}\n",
+    )  # fmt: skip
+
+
+def test_a_folder_that_is_not_writable(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    code, out, err = run(monkeypatch, capsys, f"robustness --out {tmp_path}/new", cli.main)
+    words = f"cannot write into {tmp_path}/new: {tmp_path} is not writable\n"
+    assert (code, out, err) == (2, "", f"jaxpend robustness: {words}")
+
+
+def test_optimise_knows_its_command_line():
+    line = ["--robot", "acrobot", "--search.starts=8", "--out", "a b"]
+    call = cli.parse(commands.optimise, "jaxpend optimise", line)
+    assert (
+        call.keywords["command"] == "jaxpend optimise --robot acrobot --search.starts=8 --out 'a b'"
+    )
+    assert call.keywords["search"].starts == 8
