@@ -153,7 +153,7 @@ def test_file_round_trip(tmp_path, robot, history):
         (lambda a, h: h.update(torque_limit=0.0), "not finite or not positive"),
         (lambda a, h: h.update(robot="cartpole"), "unknown robot 'cartpole'"),
         (lambda a, h: h.update(activation="exp"), "unknown activation 'exp'"),
-        (lambda a, h: h["observation"].update(kind="pixels"), "unknown observation kind"),
+        (lambda a, h: h["observation"].update(kind="pixels"), "it must be wrapped or sincos"),
     ],
 )
 def test_damaged_contents_are_one_sentence(tmp_path, change, words):
