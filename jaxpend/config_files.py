@@ -78,7 +78,7 @@ def load_config(default: T, path: str | Path, also: Sequence[str] = ()) -> T:
     Raises:
         JaxpendError: the file cannot be read, or names an unknown field or a bad value.
     """
-    file = Path(path)
+    file: Any = Path(path)
     if str(path) in recipes():
         file = resources.files("jaxpend").joinpath(f"recipes/{path}.yaml")
     elif not os.path.exists(path):

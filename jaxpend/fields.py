@@ -95,9 +95,13 @@ class Checked:
             object.__setattr__(self, field.name, value)
 
 
-@functools.cache
 def hints_of(owner: Any) -> dict[str, Any]:
     """Name -> type of the fields of a class or the parameters of a function, bounds included."""
+    return _hints_of(owner)
+
+
+@functools.cache
+def _hints_of(owner: Any) -> dict[str, Any]:
     hints = typing.get_type_hints(owner, include_extras=True)
     if dataclasses.is_dataclass(owner):
         return {field.name: hints[field.name] for field in dataclasses.fields(owner)}
@@ -141,29 +145,34 @@ def _fitted(hint: Any, value: Any, text: bool) -> Any:
     if typing.get_origin(kind) is tuple:
         return _fitted_tuple(kind, value, text)
     if typing.get_origin(kind) is Literal:
-        if not any(value is choice or value == choice for choice in typing.get_args(kind)):
+        if not (isinstance(value, str) and value in typing.get_args(kind)):
             raise _Unfit(value, f"be {described(kind)}")
         return value
     given = value
     if text and isinstance(value, str):
         value = _from_text(kind, value)
     if kind in (int, float):
-        fits = numbers.Integral if kind is int else numbers.Real
-        if isinstance(value, bool) or not isinstance(value, fits):
-            raise _Unfit(given, f"be {described(kind)}")
-        if kind is int and abs(value) > LARGEST:
-            raise _Unfit(value, "be at most 2,147,483,647" if value > 0 else "not be so small")
-        try:
-            value = kind(value)
-        except OverflowError:
-            raise _Unfit(value, "be finite") from None
-        if missed := bounds.missed(value):
-            raise _Unfit(value, missed)
-    elif not isinstance(value, kind):
+        return _fitted_number(kind, bounds, value, given)
+    if not isinstance(value, kind):
         raise _Unfit(given, f"be {described(kind)}")
-    elif kind is str and "\0" in value:
+    if kind is str and "\0" in value:
         raise _Unfit(value, "hold no null character")
     return value
+
+
+def _fitted_number(kind: Any, bounds: Bounds, value: Any, given: Any) -> int | float:
+    fits: type = numbers.Integral if kind is int else numbers.Real
+    if isinstance(value, bool) or not isinstance(value, fits):
+        raise _Unfit(given, f"be {described(kind)}")
+    try:
+        number = kind(value)
+    except OverflowError:
+        raise _Unfit(value, "be finite") from None
+    if kind is int and abs(number) > LARGEST:
+        raise _Unfit(number, f"be from {-LARGEST:,} to {LARGEST:,}")
+    if missed := bounds.missed(number):
+        raise _Unfit(number, missed)
+    return number
 
 
 def _fitted_tuple(kind: Any, value: Any, text: bool) -> tuple:

@@ -241,7 +241,7 @@ def _help(
     places = "".join(f" {o.name}" if o.default is REQUIRED else f" [{o.name}]"
                      for o in options if o.positional)  # fmt: skip
     lines = [f"usage: {prog}{places} [OPTIONS]", ""]
-    summary = [inspect.getdoc(function).partition("\n\n")[0]]
+    summary = [_docstring(function).partition("\n\n")[0]]
     if "config" in hints_of(function):
         summary.append(
             f"--config FILE reads a YAML file first, or a recipe that ships with the package "
@@ -291,8 +291,12 @@ def _metavar(kind: Any) -> str:
     return {int: "INTEGER", float: "NUMBER", str: "TEXT"}.get(kind, "PATH")
 
 
+def _docstring(owner: Any) -> str:
+    return inspect.getdoc(owner) or ""
+
+
 def _first_sentence(owner: Any) -> str:
-    text = " ".join(inspect.getdoc(owner).partition("\n\n")[0].split())
+    text = " ".join(_docstring(owner).partition("\n\n")[0].split())
     return text.partition("; see")[0].rstrip(".") + "."
 
 
@@ -300,7 +304,7 @@ def _first_sentence(owner: Any) -> str:
 def _about(owner: Any) -> dict[str, str]:
     """Name -> what it means: ``Args`` of a docstring, or the comment behind or above a field."""
     if not isinstance(owner, type):
-        args = inspect.getdoc(owner).partition("Args:\n")[2].partition("\n\n")[0]
+        args = _docstring(owner).partition("Args:\n")[2].partition("\n\n")[0]
         parts = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", args, re.MULTILINE)
         return {name: " ".join(text.split()) for name, text in parts}
     found: dict[str, str] = {}
