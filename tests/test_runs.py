@@ -13,7 +13,7 @@ from conftest import limited_file_size
 from jaxpend import JaxpendError, Policy, cli, load_policy
 from jaxpend.config import TrainRun
 from jaxpend.config_files import to_mapping
-from jaxpend.controllers.policy import read_header
+from jaxpend.controllers.files import read_header
 from jaxpend.runs.folder import RunFolder
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"

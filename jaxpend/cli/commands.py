@@ -265,6 +265,7 @@ def leaderboard(
     check_file(out)
     from .. import leaderboard as boards
     from ..terminal import console
+    from .tables import leaderboard_table
 
     def say(line: str) -> None:
         console.print(line, style="dim")
@@ -272,7 +273,7 @@ def leaderboard(
     board, chosen = _board(robot, plant, design), boards.chosen(controllers, policy, robot)
     options = {"robustness": robustness, "keys": keys, "seed": seed}
     result = boards.leaderboard(board, chosen, say=say, **options)
-    boards.show(result)
+    leaderboard_table(result)
     emit_json(result, json)
     if out is not None:
         write_atomically(out, boards.markdown(result))

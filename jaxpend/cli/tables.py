@@ -13,8 +13,11 @@ from ..terminal import console
 if TYPE_CHECKING:
     from ..boards import Board
 
-__all__ = ["robustness_table", "runs_table", "score_table", "seeds_table"]
+__all__ = ["leaderboard_table", "robustness_table", "runs_table", "score_table", "seeds_table"]
 
+# Headings of ``leaderboard_table``, in the order of ``boards.HEADINGS`` and ``boards.CRITERIA``.
+SHORT = ("up s", "J", "torque²", "steps", "speed²")
+SHORT_ROBUSTNESS = ("model", "vel.", "torque", "resp.", "delay", "pulses")
 COLOURS = {"finished": "green", "running": "cyan", "interrupted": "yellow", "broken": "red"}
 
 
@@ -62,6 +65,30 @@ def robustness_table(result: Mapping[str, Any], board: "Board") -> None:
     if worst:
         values = ", ".join(f"{k} = {v:.3g}" for k, v in (worst["values"] or {}).items())
         console.print(f"{100 * worst['failures']:.1f} % of combined imperfections fail; {values}")
+
+
+def leaderboard_table(result: Mapping[str, Any]) -> None:
+    """Print a ``leaderboard.leaderboard``: two tables that fit a terminal of 80 columns.
+
+    That of the robustness only if it was measured.
+    """
+    from ..leaderboard import cells  # loads jax
+
+    parts = {"performance v2 (float64)": ["score", *SHORT]}
+    if any(row["source"] == "measured" and row["robustness"] for row in result["rows"]):
+        parts["robustness v2"] = ["robust", *SHORT_ROBUSTNESS]
+    columns = ["score", *SHORT, *SHORT_ROBUSTNESS, "robust"]
+    for title, headings in parts.items():
+        table = Table(title=f"{result['robot']}: {title}", caption="* published")
+        for heading in ("controller", *headings):
+            justify = "left" if heading == "controller" else "right"
+            table.add_column(heading, justify=justify, no_wrap=True)
+        for row in result["rows"]:
+            shown = dict(zip(columns, cells(row)[1:], strict=True))
+            style = "dim" if row["source"] == "published" else None
+            name = row["title"] + ("*" if row["source"] == "published" else "")
+            table.add_row(name, *(shown[heading] for heading in headings), style=style)
+        console.print(table)
 
 
 def runs_table(entries: Sequence[Mapping[str, Any]]) -> None:
