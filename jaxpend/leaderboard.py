@@ -86,7 +86,7 @@ def leaderboard(
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:
-    """A row as text: title, score, criteria, six robustness scores, robustness."""
+    """A row of a board as text: title, score, criteria, six robustness scores, robustness."""
 
     def shown(value: float | None, form: str) -> str:
         return "" if value is None else format(value, form)
@@ -120,8 +120,8 @@ def markdown(board: Mapping[str, Any]) -> str:
     headings = _headings()
     lines = [headings, ["---"] + ["---:"] * (len(headings) - 1)]
     for row in board["rows"]:
-        *cells, robustness = cells(row)
-        lines.append([*cells, robustness + _range(row)])
+        *others, robustness = cells(row)
+        lines.append([*others, robustness + _range(row)])
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 

@@ -215,14 +215,14 @@ def robustness(
     with jax.enable_x64(precision == "float64"):
         nominal, key = task.plant, jax.random.key(seed)
         judged = find_controller(policy, controller, task)
-        options = {"scored": scored, "chunk": chunk}
-        # The map comes first, since it refuses names that it does not know.
-        drawn = success_map(judged, nominal, map, key, options) if map is not None else None
+        if map is not None:  # first, since it refuses names that it does not know
+            options = {"scored": scored, "chunk": chunk}
+            drawn = success_map(judged, nominal, map, key, options)
         result = {"robot": robot, "controller": controller or policy or robot, "seed": seed}
         result |= {"plant": plant, "design": design}
         result |= {"precision": precision, "torque_limit": torque_limit}
-        result |= benchmark(judged, nominal, key, keys=keys, **options).as_dict()
-        if drawn is not None:
+        result |= benchmark(judged, nominal, key, keys=keys, scored=scored, chunk=chunk).as_dict()
+        if map is not None:
             result["map"] = drawn
         if worst:
             bounds = nominal_and_worst(nominal)

@@ -25,7 +25,7 @@ def score_table(results: Mapping[str, Mapping], board: "Board") -> None:
     """Print results of ``score.official``, a column each, and the published scores."""
     from ..boards import HEADINGS  # loads jax
 
-    table = Table(title=f"{board.robot}: {board.name} score (float64)")
+    table = Table(title=f"{board.robot}, {board.name}: score (float64)")
     table.add_column("")
     for name in results:
         table.add_column(name, justify="right")
@@ -44,7 +44,7 @@ def robustness_table(result: Mapping[str, Any], board: "Board") -> None:
     """Print six percentages and the overall score of a robustness report (``as_dict``)."""
     from ..boards import CRITERIA  # loads jax
 
-    title = f"{board.robot}: {board.name} robustness, {result['simulations']} runs"
+    title = f"{board.robot}, {board.name}: robustness, {result['simulations']} runs"
     table = Table(title=f"{title} of {board.task.duration:g} s")
     for heading in ("", "score [%]", "over keys [%]", "diverged"):
         table.add_column(heading, justify="right" if heading else "left")
@@ -81,8 +81,8 @@ def leaderboard_table(result: Mapping[str, Any]) -> None:
     for title, headings in parts.items():
         table = Table(title=f"{result['robot']}: {title}", caption="* published")
         for heading in ("controller", *headings):
-            justify = "left" if heading == "controller" else "right"
-            table.add_column(heading, justify=justify, no_wrap=True)
+            right = heading != "controller"
+            table.add_column(heading, justify="right" if right else "left", no_wrap=True)
         for row in result["rows"]:
             shown = dict(zip(columns, cells(row)[1:], strict=True))
             style = "dim" if row["source"] == "published" else None
