@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import jaxpend
-from jaxpend import JaxpendError, __version__, cli
+from jaxpend import JaxpendError, __version__, cli, designs
 from jaxpend.cli import cache, commands
 from jaxpend.config import TrainRun
 from jaxpend.fields import Count
@@ -530,3 +530,42 @@ def test_optimise_knows_its_command_line():
         call.keywords["command"] == "jaxpend optimise --robot acrobot --search.starts=8 --out 'a b'"
     )
     assert call.keywords["search"].starts == 8
+
+
+def test_judging_on_another_plant(tmp_path, capsys):
+    path = tmp_path / "own.yaml"
+    path.write_text(json.dumps(designs.parameters("C.1/1.0")))
+
+    def judged(**where):
+        commands.score("acrobot", controller="tvlqr", json="-", **where)
+        return json.loads(capsys.readouterr().out)
+
+    on_board, by_name, by_file = judged(), judged(design="C.1/1.0"), judged(plant=str(path))
+    assert by_name["criteria"] == by_file["criteria"] != on_board["criteria"]
+    assert (by_name["design"], by_file["plant"]) == ("C.1/1.0", str(path))
+    assert (on_board["controller"], on_board["policy"], on_board["header"]) == (
+        "tvlqr",
+        None,
+        None,
+    )
+
+
+@pytest.mark.parametrize("name", ["score", "robustness", "leaderboard"])
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--plant nothing.yaml", "cannot read nothing.yaml: No such file or directory"),
+        ("--design C.9/1.0", "unknown design 'C.9/1.0'; known: A.0/"),
+        ("--plant a --design C.1/1.0", "plant a and design C.1/1.0 are both given"),
+    ],
+)
+def test_plants_that_are_not_there(monkeypatch, capsys, name, options, words):
+    code, out, err = run(monkeypatch, capsys, f"{name} {options}", cli.main)
+    assert (code, out) == (2, "")
+    assert err.startswith(f"jaxpend {name}: {words}")
+    assert err.count("\n") == 1
+
+
+def test_a_run_knows_its_plant():
+    config = configured("--design", "C.1/1.0", "--robot", "acrobot")
+    assert (config.plant, config.design) == ("", "C.1/1.0")

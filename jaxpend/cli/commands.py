@@ -273,7 +273,8 @@ def leaderboard(
     board, chosen = _board(robot, plant, design), boards.chosen(controllers, policy, robot)
     options = {"robustness": robustness, "keys": keys, "seed": seed}
     result = boards.leaderboard(board, chosen, say=say, **options)
-    leaderboard_table(result)
+    result |= {"plant": plant, "design": design}
+    leaderboard_table(result, board)
     emit_json(result, json)
     if out is not None:
         write_atomically(out, boards.markdown(result))

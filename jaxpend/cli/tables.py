@@ -67,19 +67,20 @@ def robustness_table(result: Mapping[str, Any], board: "Board") -> None:
         console.print(f"{100 * worst['failures']:.1f} % of combined imperfections fail; {values}")
 
 
-def leaderboard_table(result: Mapping[str, Any]) -> None:
+def leaderboard_table(result: Mapping[str, Any], board: "Board") -> None:
     """Print a ``leaderboard.leaderboard``: two tables that fit a terminal of 80 columns.
 
     That of the robustness only if it was measured.
     """
     from ..leaderboard import cells  # loads jax
 
-    parts = {"performance v2 (float64)": ["score", *SHORT]}
+    parts = {"performance (float64)": ["score", *SHORT]}
     if any(row["source"] == "measured" and row["robustness"] for row in result["rows"]):
-        parts["robustness v2"] = ["robust", *SHORT_ROBUSTNESS]
+        parts["robustness"] = ["robust", *SHORT_ROBUSTNESS]
     columns = ["score", *SHORT, *SHORT_ROBUSTNESS, "robust"]
     for title, headings in parts.items():
-        table = Table(title=f"{result['robot']}: {title}", caption="* published")
+        caption = "* published" if board.published else None
+        table = Table(title=f"{board.robot}, {board.name}: {title}", caption=caption)
         for heading in ("controller", *headings):
             right = heading != "controller"
             table.add_column(heading, justify="right" if right else "left", no_wrap=True)
