@@ -23,7 +23,7 @@ from .config import SNESConfig
 from .controller import Controller, check_controller
 from .controllers.policy import change_policies
 from .controllers.search_space import coordinates
-from .pytree import pytree
+from .pytree import Pytree, pytree
 from .score import imperfect, performance
 
 __all__ = [
@@ -40,7 +40,7 @@ STRATEGIES = {name: getattr(algorithms, kind) for name, kind in config.STRATEGIE
 
 
 @pytree
-class SNESState:
+class SNESState(Pytree):
     """Everything that the search changes."""
 
     strategy: Any  # evosax state: mean and std, in units of ``_Search``, generation counter
