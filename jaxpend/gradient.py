@@ -31,7 +31,7 @@ from .controller import Controller, check_controller
 from .controllers.search_space import coordinates
 from .criteria import EPSILON
 from .plant import rk4_step
-from .pytree import pytree
+from .pytree import Pytree, pytree
 from .rollout import rollout
 from .scenario import Scenario
 from .trajopt.swingup import SwingUp, smooth_score, totals
@@ -41,7 +41,7 @@ __all__ = ["GradientConfig", "GradientState", "current", "improve", "init", "slo
 
 
 @pytree
-class GradientState:
+class GradientState(Pytree):
     """Everything that the ascent changes."""
 
     parameters: jax.Array  # (parameters,)
