@@ -424,10 +424,16 @@ def test_a_platform_that_is_not_there_is_said():
         assert done.stderr.count("\n") == 1
 
 
+# The first look at a descriptor comes right after the handler is there.
 INTERRUPTED = """
-import sys
+import os
 from jaxpend.__main__ import main
-print(flush=True)
+look = os.fstat
+def ready(descriptor):
+    os.fstat = look
+    print(flush=True)
+    return look(descriptor)
+os.fstat = ready
 main()
 """
 
