@@ -8,7 +8,7 @@ import dataclasses
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ..config import GradientRun, Run, SACRun, Search, SNESRun, TrainRun
 from ..fields import Count, Natural, Positive, Robot, Seed
@@ -16,7 +16,11 @@ from ..files import write_atomically
 from .output import check_file, check_folder, emit_json
 
 if TYPE_CHECKING:
+    import jax
+
     from ..boards import Board
+    from ..controller import Controller
+    from ..plant import Plant
 
 __all__ = [
     "execute",
@@ -184,9 +188,8 @@ def robustness(
         robot: which joint is driven: the second of the acrobot, the first of the pendubot.
         policy: a policy or controller file; by default the policy that ships with the package.
         controller: judge this instead: a known one such as tvlqr, or module:name of a
-            controller, or of a Python function (t, x) -> torque, which takes minutes (see
-            jaxpend.controllers.callback). With a policy too: the known one around that policy, or
-            the file of a controller of your own classes.
+            controller, or of a Python function (t, x) -> torque, which takes minutes. With a
+            policy too: the known one around that policy, or the file of your own classes.
         plant: YAML file of the parameters of another plant than that of the boards.
         design: or an identified plant by name, such as C.1/1.0.
         torque_limit: of the driven joint, N m; 6 on the boards.
@@ -197,8 +200,7 @@ def robustness(
         map: success over two imperfections, such as "m2 delay", 21 x 21 runs.
         worst: look for the mildest combination of imperfections that fails, in so many tries.
         chunk: runs at a time; less needs less memory.
-        out: folder for picture, CSV and JSON, with both robots side by side once both are
-            there; None writes nothing.
+        out: folder for picture, CSV and JSON, of both robots once they are there; or None.
         json: write the result as JSON to this file, or "-" for standard output.
     """
     check_folder(out)
@@ -206,33 +208,45 @@ def robustness(
     import jax
 
     from ..controllers.catalogue import find_controller
-    from ..robustness import benchmark, nominal_and_worst, success_map
-    from ..sweep import mildest_failure
     from .tables import robustness_table
 
     board = _board(robot, plant, design)
     task = dataclasses.replace(board.task, torque_limit=torque_limit)
+    result = {"robot": robot, "controller": controller or policy or robot, "seed": seed}
+    result |= {"plant": plant, "design": design, "precision": precision}
+    result["torque_limit"] = torque_limit
     with jax.enable_x64(precision == "float64"):
-        nominal, key = task.plant, jax.random.key(seed)
-        judged = find_controller(policy, controller, task)
-        if map is not None:  # first, since it refuses names that it does not know
-            options = {"scored": scored, "chunk": chunk}
-            drawn = success_map(judged, nominal, map, key, options)
-        result = {"robot": robot, "controller": controller or policy or robot, "seed": seed}
-        result |= {"plant": plant, "design": design}
-        result |= {"precision": precision, "torque_limit": torque_limit}
-        result |= benchmark(judged, nominal, key, keys=keys, scored=scored, chunk=chunk).as_dict()
-        if map is not None:
-            result["map"] = drawn
-        if worst:
-            bounds = nominal_and_worst(nominal)
-            result["worst"] = mildest_failure(nominal, judged, bounds, key, samples=worst)
+        judged, key = find_controller(policy, controller, task), jax.random.key(seed)
+        options = {"scored": scored, "chunk": chunk}
+        result |= _benchmarked(judged, task.plant, key, keys, map, worst, options)
     robustness_table(result, board)
     if out is not None:
         from ..report.figures import write_robustness
 
         write_robustness(result, out)
     emit_json(result, json)
+
+
+def _benchmarked(
+    judged: "Controller",
+    plant: "Plant",
+    key: "jax.Array",
+    keys: int,
+    map: tuple[str, str] | None,
+    worst: int,
+    options: dict[str, Any],
+) -> dict[str, Any]:
+    """The report of the benchmark, and the map and the mildest failure that are asked for."""
+    from ..robustness import benchmark, nominal_and_worst, success_map
+    from ..sweep import mildest_failure
+
+    # The map comes first, since it refuses names that it does not know.
+    drawn = {} if map is None else {"map": success_map(judged, plant, map, key, options)}
+    result = benchmark(judged, plant, key, keys=keys, **options).as_dict() | drawn
+    if worst:
+        bounds = nominal_and_worst(plant)
+        result["worst"] = mildest_failure(plant, judged, bounds, key, samples=worst)
+    return result
 
 
 def leaderboard(
