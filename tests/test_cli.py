@@ -475,7 +475,7 @@ def test_help_shows_choices_and_with_capital_h_what_fields_mean():
         assert "--sac.mirror, --sac.no-mirror (default: no)" in text
     about = ("gradient updates per vector step", "Polyak averaging of the target critics")
     assert all(words in full and words not in short for words in about)
-    assert "\n\nsac.env: The learning environment.\n" in short
+    assert "\n\nsac.env: The learning environment:\n" in short
 
 
 # --- what the commands refuse before they compute ------------------------------------------
