@@ -87,6 +87,9 @@ def run(monkeypatch, capsys, arguments, function=main):
         ("--plot there", "there pendubot 3 True fast None\n"),
         ("--pair None --keys 1 --keys 2", "here pendubot 2 True fast None\n"),
         ("-", "- pendubot 3 True fast None\n"),
+        ("--no-plot there", "there pendubot 3 False fast None\n"),
+        ("--keys 1 -- --with_this", "--with_this pendubot 1 True fast None\n"),
+        ("--robot=pendubot --pair -1e3 -inf", "here pendubot 3 True fast ('-1e3', '-inf')\n"),
     ],
 )
 def test_run_parses_calls_and_exits(monkeypatch, capsys, arguments, out):
@@ -120,6 +123,8 @@ def test_run_parses_calls_and_exits(monkeypatch, capsys, arguments, out):
         ("--kind quick", "--kind is 'quick'; it must be fast or slow"),
         ("--pair a", "--pair is 'a'; it must be 2 values, each a text"),
         ("--no-plot=yes", "--no-plot takes no value; --plot does"),
+        ("--plot=there", "--plot is 'there'; it must be yes or no"),
+        ("--plot there here", "unexpected argument 'here'; see prog --help"),
         ("--no-plat", "unknown option --no-plat; did you mean --no-plot?"),
         ("--robo acrobot", "unknown option --robo; did you mean --robot?"),
     ],

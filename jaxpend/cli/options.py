@@ -177,7 +177,8 @@ class _Parser(argparse.ArgumentParser):
 
     def values(self, args: Sequence[str]) -> dict[str, Any]:
         """What a command line says, as nested mappings of text; lists for several values."""
-        given, rest = self.parse_known_args([_spelled(word) for word in args])
+        end = [*args, "--"].index("--")  # behind it are no options
+        given, rest = self.parse_known_args([*map(_spelled, args[:end]), *args[end:]])
         for word in rest:
             name = word.partition("=")[0]
             if name.startswith("-") and name != "-":
