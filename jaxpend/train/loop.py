@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import designs
+from ..boards import v2
 from ..config import GradientRun, Run, SACRun, SNESRun, TrainRun
 from ..controller import Controller
 from ..controllers.catalogue import find_controller
@@ -208,9 +209,10 @@ def stages_of(config: Run, start: Controller | None) -> dict[str, Stage]:
     """The stages of a configuration, by name; ``start`` is what a stage alone starts from."""
     stages: list[Stage] = []
     if isinstance(config, SACRun):
+        task = v2(config.robot).task
         if config.sac.demonstrations.episodes:
-            stages.append(Imitation(config.sac))
-        stages.append(SAC(config.sac))
+            stages.append(Imitation(config.sac, task))
+        stages.append(SAC(config.sac, task))
         start = stages[-1].policy_like()
     if getattr(config, "gradient", None) and config.gradient.steps:
         stages.append(Gradient(config.gradient, start, config.robot))

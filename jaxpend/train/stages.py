@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from .. import gradient, sac, snes
+from ..boards import Task
 from ..config import GradientConfig, GuardConfig, SACConfig, SNESConfig
 from ..controller import Controller
 from ..controllers.guard import guard
@@ -105,14 +106,14 @@ class Imitation(Stage):
     name, title, unit, column = "imitation", "imitating demonstrations", "updates", "updates"
     CHUNK = 2000  # updates
 
-    def __init__(self, config: SACConfig):
-        self.config, self.total = config, config.demonstrations.updates
+    def __init__(self, config: SACConfig, task: Task):
+        self.agent, self.total = sac.Agent(config, task), config.demonstrations.updates
 
     def start(self, seed, before):
-        return sac.begin(self.config, jax.random.key(seed))
+        return sac.begin(self.agent, jax.random.key(seed))
 
     def like(self):
-        return sac.structure(self.config)
+        return sac.structure(self.agent)
 
     def policy_like(self):
         return None
@@ -124,7 +125,7 @@ class Imitation(Stage):
         count = min(self.CHUNK, self.total - self.done(states[0]))
         after = []
         for state, learner in states:
-            learner, loss = sac.imitate_chunk(self.config, state, learner, count)
+            learner, loss = sac.imitate_chunk(self.agent, state, learner, count)
             after.append(((state, learner), {"loss": loss}))
         return after
 
@@ -150,29 +151,29 @@ class SAC(Stage):
     name, title, unit, column = "sac", "SAC", "steps", "env_steps"
     ties = True  # they happen before the first success: the later policy has learned more
 
-    def __init__(self, config: SACConfig):
-        self.config, self.total = config, config.steps
+    def __init__(self, config: SACConfig, task: Task):
+        self.agent, self.total = sac.Agent(config, task), config.steps
         self.vector_steps = max(config.eval_every // config.num_envs, 1)
 
     def start(self, seed, before):
-        return sac.begin(self.config, jax.random.key(seed))[0] if before is None else before
+        return sac.begin(self.agent, jax.random.key(seed))[0] if before is None else before
 
     def like(self):
-        return sac.structure(self.config)[0]
+        return sac.structure(self.agent)[0]
 
     def policy_like(self):
-        return jax.eval_shape(partial(sac.greedy_policy, self.config), self.like())
+        return jax.eval_shape(partial(sac.greedy_policy, self.agent), self.like())
 
     def done(self, state):
         return int(state.env_steps)
 
     def advance(self, states):
         if len(states) == 1:
-            return [sac.train_chunk(self.config, states[0], self.vector_steps)]
-        return sac.train_chunks(self.config, states, self.vector_steps)
+            return [sac.train_chunk(self.agent, states[0], self.vector_steps)]
+        return sac.train_chunks(self.agent, states, self.vector_steps)
 
     def judge(self, state, metrics):
-        policy = sac.greedy_policy(self.config, state)
+        policy = sac.greedy_policy(self.agent, state)
         c = nominal(policy, policy.robot)
         score = float(score_v2(c))
         row = {"updates": int(state.updates), "score": score, "uptime": c.uptime, **metrics}
