@@ -12,6 +12,7 @@ from .observation import Observation
 from .robots import active_joint
 
 __all__ = [
+    "LINES",
     "CheckpointConfig",
     "DemonstrationConfig",
     "EnvConfig",

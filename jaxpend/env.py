@@ -8,7 +8,6 @@ and action. See ``sac.networks.Actor`` for why the policy does not see it.
 """
 
 import dataclasses
-from functools import cached_property
 
 import chex
 import jax
@@ -27,23 +26,22 @@ __all__ = ["Env", "EnvConfig", "EnvState", "Reward", "World", "surrogate_reward"
 SCENARIO_DT = 0.002  # s, the steps in which delays, noise and responses of scenarios are meant
 
 
-def surrogate_reward(
-    plant: Plant, reward: Reward, x: jax.Array, action: jax.Array, previous_action: jax.Array
-) -> jax.Array:
-    """Reward of arriving in state ``x`` (4,) by ``action`` (), after ``previous_action`` ().
+def surrogate_reward(plant: Plant, reward: Reward, line: float, x, action, before) -> jax.Array:
+    """Reward of arriving in state ``x`` (4,) by ``action`` (), after the action ``before`` ().
 
     With end-effector height y, potential and kinetic energy V and T, and action change da:
     ``V + alpha (1 + cos theta2)^2 - beta T - rho1 a^2 - phi1 |da|`` where y is above the line,
-    ``V - rho2 a^2 - phi2 |da| - eta (omega1^2 + omega2^2)`` below it, at least ``floor``.
+    ``V - rho2 a^2 - phi2 |da| - eta (omega1^2 + omega2^2)`` below it, at least ``floor``. The
+    ``line`` is a height in m; that of the coefficients may be None.
     """
     height = forward_kinematics(plant, x)[1, 1]
     potential, kinetic = potential_energy(plant, x), kinetic_energy(plant, x)
-    effort, change = action**2, jnp.abs(action - previous_action)
+    effort, change = action**2, jnp.abs(action - before)
     straight = (1 + jnp.cos(x[1])) ** 2
     above = reward.alpha * straight - reward.beta * kinetic
     above = above - reward.rho1 * effort - reward.phi1 * change
     below = -reward.rho2 * effort - reward.phi2 * change - reward.eta * (x[2] ** 2 + x[3] ** 2)
-    total = potential + jnp.where(height > reward.line, above, below)
+    total = potential + jnp.where(height > line, above, below)
     return jnp.maximum(total, reward.floor)
 
 
@@ -88,21 +86,13 @@ class Env:
         """The nominal plant, with the torque limit of the configuration."""
         return self.task.limited(self.config.torque_limit)
 
-    @cached_property
-    def reward(self) -> Reward:
-        """The coefficients of the reward, with the line of the task's robot if none is chosen."""
-        reward = self.config.reward
-        line = LINES[self.task.robot] if reward.line is None else reward.line
-        return dataclasses.replace(reward, line=line)
+    @property
+    def line(self) -> float:
+        """The height, m, above which the reward asks for balance: that of the task's robot."""
+        line = self.config.reward.line
+        return LINES[self.task.robot] if line is None else line
 
-    def observe(
-        self,
-        x: jax.Array,
-        action: jax.Array,
-        past: jax.Array | None,
-        world: World | None,
-        reward: jax.Array,
-    ) -> EnvState:
+    def observe(self, x, action, past, world, reward) -> EnvState:
         """A state with what is seen in it; the arguments are as in ``EnvState``."""
         view, privileged = self.config.observation, action[None]
         if world is not None:
@@ -149,7 +139,7 @@ class Env:
             x = rk4_step(self.plant, x, torque, self.config.dt)
         else:
             x, world = self._through(world, x, torque)
-        reward = surrogate_reward(self.plant, self.reward, x, a, state.action)
+        reward = surrogate_reward(self.plant, self.config.reward, self.line, x, a, state.action)
         return self.observe(x, a, past, world, reward)
 
     def kicked(self, state: EnvState, change: jax.Array) -> EnvState:

@@ -64,7 +64,7 @@ def paper_reward(robot, x, action, previous):
 def test_reward_is_the_papers(robot, where, action, previous):
     env = make(robot)
     x = np.array(STATES[where])
-    reward = surrogate_reward(env.plant, env.reward, x, action, previous)
+    reward = surrogate_reward(env.plant, env.config.reward, env.line, x, action, previous)
     assert_close(reward, paper_reward(robot, x, action, previous))
 
 
@@ -72,23 +72,23 @@ def test_the_cases_lie_on_both_sides_of_the_line():
     length = designs.competition("acrobot").length
     y = {k: -length @ np.cos([x[0], x[0] + x[1]]) for k, x in STATES.items()}
     assert y["top"] > 0.375 > y["between"] > 0.35 > y["bent"] > y["hanging"]
-    assert make("acrobot").reward.line == 0.375
-    assert make("pendubot").reward.line == 0.35
-    assert make("acrobot", reward=Reward(line=0.4, alpha=3.0)).reward == Reward(0.4, alpha=3.0)
+    assert make("acrobot").line == 0.375
+    assert make("pendubot").line == 0.35
+    assert make("acrobot", reward=Reward(line=0.4)).line == 0.4
 
 
 @pytest.mark.x64
 def test_coefficients_and_floor_are_those_of_the_configuration():
     plant = designs.competition("pendubot")
-    other = Reward(line=0.0, alpha=3.0, beta=0.5, rho1=1.0, rho2=2.0, phi1=3.0, phi2=4.0, eta=5.0)
+    other = Reward(alpha=3.0, beta=0.5, rho1=1.0, rho2=2.0, phi1=3.0, phi2=4.0, eta=5.0)
     zeroed = dict.fromkeys(("alpha", "beta", "rho1", "rho2", "phi1", "phi2", "eta"), 0.0)
     for where in ("top", "hanging"):
         x = jnp.array(STATES[where])
 
         def earned(reward, x=x):
-            return float(surrogate_reward(plant, reward, x, 0.5, -0.1))
+            return float(surrogate_reward(plant, reward, 0.0, x, 0.5, -0.1))
 
-        nothing = Reward(line=0.0, **zeroed)
+        nothing = Reward(**zeroed)
         terms = [
             earned(dataclasses.replace(nothing, **{name: getattr(other, name)})) - earned(nothing)
             for name in zeroed

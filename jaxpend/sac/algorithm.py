@@ -7,6 +7,7 @@ bootstraps from the true next state.
 
 import dataclasses
 from functools import cached_property, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from ..pytree import pytree
 from . import losses, replay
 from .critics import Critic, TwinCritic
 from .demonstrations import Imitation, imitate, imitation, swingups
-from .networks import Actor, Params, constant_log_std, sample_action, to_policy
+from .networks import Actor, Params, act, constant_log_std, to_policy
 from .replay import Replay, Transition
 
 __all__ = [
@@ -189,7 +190,7 @@ def update(
     key_critic, key_actor = jax.random.split(key)
     temperature = jnp.exp(state.log_temperature)
 
-    next_action, log_prob = sample_action(*actor.apply(state.actor, batch.next_obs), key_critic)
+    next_action, log_prob = act(actor, state.actor, batch.next_obs, key_critic)
     (loss_q, value), grads = jax.value_and_grad(critic.loss, has_aux=True)(
         state.critic, state.target, batch, next_action, temperature * log_prob, config.discount
     )
@@ -197,7 +198,7 @@ def update(
     critic_params = optax.apply_updates(state.critic, updates)
 
     def actor_loss(params):
-        action, log_prob = sample_action(*actor.apply(params, batch.obs), key_actor)
+        action, log_prob = act(actor, params, batch.obs, key_actor)
         value = critic.value(critic_params, batch.obs, batch.privileged, action)
         loss = losses.actor(value, temperature * log_prob)
         if batch.wanted is not None:
@@ -233,7 +234,7 @@ def interact(agent: Agent, state: SACState, key: jax.Array) -> tuple[SACState, j
     """
     config, env, before = agent.config, agent.env, state.envs
     key_action, key_uniform, key_reset = jax.random.split(key, 3)
-    action, _ = sample_action(*agent.actor.apply(state.actor, before.obs), key_action)
+    action, _ = act(agent.actor, state.actor, before.obs, key_action)
     uniform = jax.random.uniform(key_uniform, action.shape, minval=-1.0, maxval=1.0)
     action = jnp.where(state.env_steps < config.warmup_steps, uniform, action)
     after = jax.vmap(env.step)(before, action)
@@ -315,8 +316,10 @@ def train_chunks(
     What counts steps is the same in all runs and not batched: a batched condition would become a
     select that copies the replay buffers at every step.
     """
-    axes = SACState(**{f.name: 0 for f in dataclasses.fields(SACState)}).replace(
-        replay=Replay(0, None, None), env_steps=None, updates=None
+    first: Any = 0  # the batched axis; None where nothing is batched
+    none: Any = None
+    axes = SACState(**dict.fromkeys(SACState.__dataclass_fields__, first)).replace(
+        replay=Replay(first, none, none), env_steps=none, updates=none
     )
 
     def per_axis(batched, shared, *trees):

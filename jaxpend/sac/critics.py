@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Protocol
 
-import jax
+from jax import Array
 
 from . import losses
 from .networks import Params, Twins
@@ -15,33 +15,21 @@ __all__ = ["Critic", "TwinCritic"]
 class Critic(Protocol):
     """A hashable value; ``params`` are what ``init`` returns, n is the size of a batch."""
 
-    def init(
-        self, key: jax.Array, obs: jax.Array, privileged: jax.Array, action: jax.Array
-    ) -> Params:
+    def init(self, key: Array, obs: Array, privileged: Array, action: Array) -> Params:
         """Parameters for what is seen and done, of these shapes; ``key`` is consumed."""
-        ...
 
-    def value(
-        self, params: Params, obs: jax.Array, privileged: jax.Array, action: jax.Array
-    ) -> jax.Array:
+    def value(self, params: Params, obs: Array, privileged: Array, action: Array) -> Array:
         """What the actor climbs, (...,): the expected return of actions (...,)."""
-        ...
 
     def loss(
-        self,
-        params: Params,
-        target: Params,
-        batch: Transition,
-        next_action: jax.Array,
-        next_cost: jax.Array,
-        discount: float,
-    ) -> tuple[jax.Array, jax.Array]:
+        self, params: Params, target: Params, batch: Transition, next_action: Array,
+        next_cost: Array, discount: float,
+    ) -> tuple[Array, Array]:  # fmt: skip
         """The loss () and the mean value () on a batch (n, ...).
 
         ``target`` are slowly following parameters, ``next_action`` (n,) is drawn by the actor
         in the next state, ``next_cost`` (n,) the temperature times its log-probability.
         """
-        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,15 +46,13 @@ class TwinCritic:
         return Twins(self.hidden, self.activation, self.layer_norm)
 
     def init(self, key, obs, privileged, action):
-        """See ``Critic``."""
         return self.network.init(key, obs, privileged, action)
 
     def value(self, params, obs, privileged, action):
-        """See ``Critic``."""
         return self.network.apply(params, obs, privileged, action).min(axis=-1)
 
     def loss(self, params, target, batch, next_action, next_cost, discount):
-        """See ``Critic``; the squared distance of both to the soft target."""
+        """The squared distance of both values to the soft target."""
         next_value = self.value(target, batch.next_obs, batch.next_privileged, next_action)
         goal = losses.soft_target(batch.reward, next_value, next_cost, discount)
         q = self.network.apply(params, batch.obs, batch.privileged, batch.action)

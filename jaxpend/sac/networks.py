@@ -1,7 +1,7 @@
 """Flax networks of SAC: a tanh-Gaussian actor, action values, and the policy made of an actor."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from ..controllers.policy import ACTIVATIONS, Policy
 from ..env import Env
 
-__all__ = ["Actor", "Params", "Twins", "constant_log_std", "sample_action", "to_policy"]
+__all__ = ["Actor", "Params", "Twins", "act", "constant_log_std", "sample_action", "to_policy"]
 
 LOG_STD_RANGE = (-10.0, 2.0)
 
-Params = dict[str, Any]  # of a Flax network: {"params": {layer: ...}}
+Params = Mapping[str, Any]  # of a Flax network: {"params": {layer: ...}}
 
 
 class Trunk(nn.Module):
@@ -86,6 +86,14 @@ def sample_action(
     log_prob = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
     log_prob = log_prob - 2 * (jnp.log(2.0) - v - jax.nn.softplus(-2 * v))
     return jnp.tanh(v)[..., 0], log_prob[..., 0]
+
+
+def act(
+    actor: Actor, params: Params, obs: jax.Array, key: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """``sample_action`` for observations (..., obs_size)."""
+    mean, log_std = cast(tuple[jax.Array, jax.Array], actor.apply(params, obs))
+    return sample_action(mean, log_std, key)
 
 
 def constant_log_std(actor_params: Params, log_std: float) -> Params:

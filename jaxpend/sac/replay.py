@@ -78,8 +78,9 @@ def mirrored(env: Env, batch: Transition, key: jax.Array) -> Transition:
     """The same, each by chance as a mirror shows it; ``key`` is consumed."""
     flip = jax.random.bernoulli(key, shape=batch.action.shape)
     obs, privileged = map(jnp.array, env.mirrored)
-    wanted = None if batch.wanted is None else -1
-    signs = Transition(obs, privileged, -1, 1, obs, privileged, wanted)
+    one = jnp.ones(())
+    wanted = None if batch.wanted is None else -one
+    signs = Transition(obs, privileged, -one, one, obs, privileged, wanted)
 
     def seen(value, sign):
         there = jnp.expand_dims(flip, tuple(range(flip.ndim, value.ndim)))
