@@ -33,9 +33,9 @@ import numpy as np
 from jaxpend import designs, leaderboard, load_policy
 from jaxpend.cli import emit_json
 from jaxpend.config import STRATEGIES, GradientConfig, SACRun, SNESConfig
+from jaxpend.config_files import load_config
 from jaxpend.controllers import guard
 from jaxpend.files import write_atomically
-from jaxpend.runs.folder import load_config
 from jaxpend.sweep import sweep
 from jaxpend.terminal import console
 from jaxpend.train.loop import train

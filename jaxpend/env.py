@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from .boards import Task
 from .config import LINES, EnvConfig, Reward
 from .plant import Plant, forward_kinematics, kinetic_energy, potential_energy, rk4_step
-from .pytree import pytree
+from .pytree import Pytree, pytree
 from .rollout import actuate, draws, measure
 from .scenario import Scenario
 from .variations import LONGEST_DELAY, sample
@@ -46,7 +46,7 @@ def surrogate_reward(plant: Plant, reward: Reward, line: float, x, action, befor
 
 
 @pytree
-class World:
+class World(Pytree):
     """The random scenario of an episode, and what a rollout in it carries from step to step."""
 
     scenario: Scenario
@@ -58,7 +58,7 @@ class World:
 
 
 @pytree
-class EnvState:
+class EnvState(Pytree):
     """An episode at one time."""
 
     x: jax.Array  # (4,) the true state

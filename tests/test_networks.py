@@ -99,7 +99,7 @@ def test_constant_log_std_changes_nothing_else(actor):
 def test_critics_are_two_and_see_everything_and_the_lower_counts(layer_norm):
     critic = TwinCritic((8,), "relu", layer_norm)
     params = critic.init(jax.random.key(0), OBS, BEFORE, ACTIONS)
-    apply, now = jax.jit(critic.network.apply), (OBS, BEFORE, ACTIONS)
+    apply, now = jax.jit(critic.both), (OBS, BEFORE, ACTIONS)
     q = apply(params, *now)
     assert q.shape == (5, 2)
     assert not np.allclose(q[:, 0], q[:, 1])

@@ -152,7 +152,7 @@ def test_values_bootstrap_through_the_time_limit_with_the_entropy_on_top():
     np.testing.assert_allclose(metrics["entropy"], entropy, atol=0.02)
     x = np.zeros((9, 4), "f4")
     x[:, 0] = np.linspace(-0.6, 0.6, 9)
-    q = VALUE.critic.network.apply(state.critic, x, np.zeros((9, 1), "f4"), np.zeros(9, "f4"))
+    q = VALUE.critic.both(state.critic, x, np.zeros((9, 1), "f4"), np.zeros(9, "f4"))
     expected = (1 + x[:, :1] + 0.8 * 0.5 * entropy) / (1 - 0.8)
     np.testing.assert_allclose(q, np.repeat(expected, 2, axis=1), atol=0.6)
     np.testing.assert_allclose(q.mean(), expected.mean(), atol=0.25)
@@ -198,7 +198,7 @@ def test_critics_learn_towards_the_lower_target_value_of_the_next_observation():
     shifted = jax.tree.map(lambda w: w + 0.3, state.target)
     state = with_actor(state, -10.0, -20.0).replace(target=shifted)  # no noise, no entropy
     after, metrics = update(CREDIT, state, batch, KEY)
-    both = CREDIT.critic.network.apply
+    both = CREDIT.critic.both
     next_seen = batch.next_obs, batch.next_privileged
     next_action = greedy(CREDIT, state, batch.next_obs)
     q_next = np.asarray(both(state.target, *next_seen, next_action))
@@ -406,7 +406,7 @@ def test_learning_rate_decays_over_the_whole_run():
         ({"learning_rate": -1.0}, "learning_rate is -1.0; it must be positive"),
         ({"discount": 1.0}, "discount is 1.0; it must be below 1"),
         ({"num_envs": 8, "replay_capacity": 7}, "must hold at least one step of all"),
-        ({"activation": "exp"}, "unknown activation 'exp'; known: relu, tanh, silu"),
+        ({"activation": "exp"}, "activation is 'exp'; it must be relu, tanh or silu"),
     ],
 )
 def test_senseless_values_are_one_sentence(values, words):

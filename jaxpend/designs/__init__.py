@@ -9,10 +9,12 @@ import math
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from ..config_files import read_yaml
 from ..errors import JaxpendError, choose
 from ..plant import Plant
 from ..robots import ROBOTS, active_joint
@@ -26,6 +28,8 @@ __all__ = [
     "from_dict",
     "from_file",
     "load",
+    "parameters",
+    "read",
 ]
 
 _REQUIRED = ("m1", "m2", "l1", "l2", "r1", "r2", "I1", "I2")
@@ -91,26 +95,41 @@ def from_dict(
         if not torque_limit > 0:
             raise JaxpendError(f"torque limit is {torque_limit} N m; it must be positive")
         limit = np.where(actuation, torque_limit, 0.0)
-    pair = lambda name: np.array([p[name + "1"], p[name + "2"]])  # noqa: E731
-    values = Plant(
-        mass=pair("m"), length=pair("l"), com=pair("r"), inertia=pair("I"), damping=pair("b"),
-        coulomb_friction=pair("cf"), torque_limit=limit, actuation=np.asarray(actuation, float),
-        gravity=np.array(p["g"]), motor_inertia=np.array(p["Ir"]), gear_ratio=np.array(p["gr"]),
-    )  # fmt: skip
+    pairs = {"mass": "m", "length": "l", "com": "r", "inertia": "I", "damping": "b"}
+    pairs |= {"coulomb_friction": "cf"}
+    values: dict[str, Any] = {k: [p[f"{v}1"], p[f"{v}2"]] for k, v in pairs.items()}
+    values |= {"torque_limit": limit, "actuation": actuation, "gravity": p["g"]}
+    values |= {"motor_inertia": p["Ir"], "gear_ratio": p["gr"]}
     # numpy, not jax, arrays: made inside a jitted function, they are still known constants.
-    return Plant(**{k: np.asarray(v, jnp.result_type(float)) for k, v in vars(values).items()})
+    arrays: Any = {k: np.asarray(v, jnp.result_type(float)) for k, v in values.items()}
+    return Plant(**arrays)
+
+
+def read(path: str | Path) -> dict[str, float]:
+    """Parameters as ``from_dict`` takes them, of a YAML (or JSON) file.
+
+    Raises ``JaxpendError`` if it cannot be read, or holds something else.
+    """
+    parameters = read_yaml(Path(path))
+    try:
+        from_dict(parameters)
+    except JaxpendError as error:
+        raise JaxpendError(f"{path}: {error}") from None
+    return dict(parameters)
 
 
 def from_file(path: str | Path, **kwargs) -> Plant:
     """``from_dict`` on a YAML (or JSON) file. Raises ``JaxpendError`` if it cannot be read."""
-    import yaml  # only users with files of their own pay for it
+    return from_dict(read(path), **kwargs)
 
-    try:
-        parameters = yaml.safe_load(Path(path).read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = getattr(error, "strerror", None) or "not valid YAML"
-        raise JaxpendError(f"cannot read plant parameters from {path}: {reason}") from None
-    return from_dict(parameters, **kwargs)
+
+def parameters(name: str) -> dict[str, float]:
+    """Parameters as ``from_dict`` takes them, of an identified set by name, such as "C.1/1.0".
+
+    Raises ``JaxpendError`` for an unknown name; the message lists the known ones.
+    """
+    design, model = choose("design", name, available()).split("/")
+    return _table()[design][model]
 
 
 def load(

@@ -17,7 +17,7 @@ from ..boards import Task
 from ..config import SACConfig
 from ..controllers.policy import Policy
 from ..env import Env, EnvState
-from ..pytree import pytree
+from ..pytree import Pytree, pytree
 from . import losses, replay
 from .critics import Critic, TwinCritic
 from .demonstrations import Imitation, imitate, imitation, swingups
@@ -78,7 +78,7 @@ class Agent:
 
 
 @pytree
-class SACState:
+class SACState(Pytree):
     """Everything that training changes."""
 
     actor: Params

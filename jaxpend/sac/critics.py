@@ -1,7 +1,7 @@
 """Critics: what judges the actions of an actor. Another critic is another class of this form."""
 
 import dataclasses
-from typing import Protocol
+from typing import Protocol, cast
 
 from jax import Array
 
@@ -45,15 +45,19 @@ class TwinCritic:
         """Of both values."""
         return Twins(self.hidden, self.activation, self.layer_norm)
 
+    def both(self, params: Params, obs: Array, privileged: Array, action: Array) -> Array:
+        """Both values (..., 2)."""
+        return cast(Array, self.network.apply(params, obs, privileged, action))
+
     def init(self, key, obs, privileged, action):
         return self.network.init(key, obs, privileged, action)
 
     def value(self, params, obs, privileged, action):
-        return self.network.apply(params, obs, privileged, action).min(axis=-1)
+        return self.both(params, obs, privileged, action).min(axis=-1)
 
     def loss(self, params, target, batch, next_action, next_cost, discount):
         """The squared distance of both values to the soft target."""
         next_value = self.value(target, batch.next_obs, batch.next_privileged, next_action)
         goal = losses.soft_target(batch.reward, next_value, next_cost, discount)
-        q = self.network.apply(params, batch.obs, batch.privileged, batch.action)
+        q = self.both(params, batch.obs, batch.privileged, batch.action)
         return losses.squared_error(q, goal), q.mean()

@@ -18,7 +18,7 @@ from ..controller import Controller
 from ..controllers import load_reference, tvlqr
 from ..env import Env
 from ..errors import JaxpendError
-from ..pytree import pytree
+from ..pytree import Pytree, pytree
 from ..scenario import random_pulses
 from . import losses, replay
 from .networks import Actor, Params
@@ -92,7 +92,7 @@ def swingups(
 
 
 @pytree
-class Imitation:
+class Imitation(Pytree):
     """An actor on its way to the demonstrated actions."""
 
     params: Params
@@ -130,7 +130,7 @@ def imitate(
 
         def loss(params):
             mean, _ = actor.apply(params, batch.obs)
-            return losses.imitation(mean[:, 0], batch.wanted)
+            return losses.imitation(mean[:, 0], jnp.asarray(batch.wanted))
 
         error, grads = jax.value_and_grad(loss)(params)
         change, opt_state = _adam(config).update(grads, opt_state)

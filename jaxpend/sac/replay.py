@@ -5,13 +5,13 @@ import jax
 import jax.numpy as jnp
 
 from ..env import Env, EnvState
-from ..pytree import pytree
+from ..pytree import Pytree, pytree
 
 __all__ = ["Replay", "Transition", "add", "fill", "init", "mirrored", "sample"]
 
 
 @pytree
-class Transition:
+class Transition(Pytree):
     """One step of one environment; all fields have the same leading axes."""
 
     obs: jax.Array  # (..., obs_size), what the policy saw
@@ -30,7 +30,7 @@ class Transition:
 
 
 @pytree
-class Replay:
+class Replay(Pytree):
     """The last transitions of some environments, or the demonstrations, as of one environment."""
 
     data: Transition  # (time, environment, ...)

@@ -18,14 +18,13 @@ from ..errors import JaxpendError
 from ..files import to_json, write_atomically
 from ..runs.checkpoints import Checkpoints
 from ..runs.folder import RunFolder
-from ..runs.reader import RESULTS
-from ..runs.seeds import seeds_table, summary
+from ..runs.seeds import summary
 from ..score import official
-from ..terminal import LiveProgress, console, score_table
+from ..terminal import LiveProgress, console
 from .interrupt import Stopped, deferred, stop_if_asked
 from .stages import SAC, SNES, Gradient, Imitation, Stage
 
-__all__ = ["execute", "train"]
+__all__ = ["train"]
 
 
 @dataclasses.dataclass
@@ -283,13 +282,3 @@ def train_group(runs: Sequence[SeedRun], stages: Mapping[str, Stage], start: Any
     for run in runs:
         if not run.failed:
             run.finish()
-
-
-def execute(config: Run, command: str) -> None:
-    """``train``, the score table, and where the results are."""
-    result = train(config, command)
-    if config.seeds > 1:
-        seeds_table(result)
-    else:
-        score_table({RESULTS[k]: result[k] for k in RESULTS if k in result}, config.robot)
-    console.print(f"policy.npz, metrics and result are in [bold]{config.folder}[/bold]")
