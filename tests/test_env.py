@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import subprocess
+import sys
 
 import chex
 import jax
@@ -312,6 +314,11 @@ def test_a_share_of_episodes_starts_near_upright_and_only_there():
     starts = [make(randomised=1.0, upright_starts=share).reset(keys[0]) for share in (0.0, 1.0)]
     chex.assert_trees_all_equal(*(start.world.scenario for start in starts))
     assert starts[0].x[0] == 0 != starts[1].x[0]
+
+
+def test_nobody_who_trains_waits_for_brax():
+    code = "import sys, jaxpend.env, jaxpend.sac; assert 'brax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_episode_steps():
