@@ -21,8 +21,7 @@ from ..files import write_atomically
 from ..robots import active_joint
 from ..robustness import CRITERIA, benchmark
 from ..runs.folder import to_mapping
-from ..runs.reader import RESULTS, STAGES
-from ..runs.record import CURVES, Found, remarks
+from ..runs.reader import RunRecord, StageRecord, remarks
 from ..runs.statistics import interquartile_mean, interval
 from ..score import V2_OFFICIAL, nominal_run, score_v2
 from . import figures as plots
@@ -51,7 +50,7 @@ class Judged:
         return self.criteria["swingup_time"] if self.success else None
 
 
-def judge(found: Found, robustness: bool = True) -> Judged | None:
+def judge(found: RunRecord, robustness: bool = True) -> Judged | None:
     """The swing-up of the best policy so far, its official score (float64) and its robustness.
 
     None where there is no policy yet. The policies of several seeds share one compilation.
@@ -81,35 +80,37 @@ def judge(found: Found, robustness: bool = True) -> Judged | None:
     )
 
 
-def _curve(run: Found, stage: str, column: str):
+def _curve(run: RunRecord, stage: StageRecord, column: str):
     """Two arrays: what is on x and on y, where the column has a number.
 
     The column "best" is the best official score so far, those of earlier stages included.
     """
-    order, top, points = list(CURVES), -math.inf, []
-    good = [row for row in run.rows if row.get("finite") != 0]
-    for row in sorted(good, key=lambda row: order.index(row["stage"])):
-        scores = (row.get(k) for k in ("score", "mean_score", "individual_score"))
-        top = max([top, *(score for score in scores if score is not None)])
+    scores = {stage.name: stage.scores for stage in run.stages}
+    top, points = -math.inf, []
+    for row in run.rows:
+        if row.get("finite") == 0:
+            continue
+        top = max([top, *(row[name] for name in scores[row["stage"]] if name in row)])
         y = top if column == "best" else row.get(column)
-        if row["stage"] == stage and y is not None:
-            points.append((row[CURVES[stage][1]], y))
+        if row["stage"] == stage.name and y is not None and math.isfinite(y):
+            points.append((row[stage.column], y))
     return np.array([x for x, _ in points]), np.array([y for _, y in points])
 
 
-def _learning(runs: Sequence[Found]) -> Iterator[tuple[str, Any]]:
-    """Name of a stage, and a chart: a function of axes. Of several runs, the first column."""
-    for key, (stage, _, xlabel, charts) in CURVES.items():
-        for title, columns, ylabel, log in charts:
+def _learning(runs: Sequence[RunRecord]) -> Iterator[tuple[str, Any]]:
+    """Title of a stage, and a chart: a function of axes. Of several runs, the first column."""
+    # Seeds have the same stages; of an old run that has just begun, not all charts are known.
+    for stage in max((run.stages for run in runs), key=lambda s: sum(len(x.charts) for x in s)):
+        for title, columns, ylabel, log in stage.charts:
             shown = list(columns.items())
             if len(runs) > 1:
                 title += f", {shown[0][0]}" * (len(shown) > 1)
                 shown = shown[:1]
-            curves = {label: [_curve(run, key, name) for run in runs] for label, name in shown}
+            curves = {label: [_curve(run, stage, name) for run in runs] for label, name in shown}
             curves = {k: v for k, v in curves.items() if any(len(x) for x, _ in v)}
             if curves:
-                options = {"xlabel": xlabel, "ylabel": ylabel, "log": log}
-                yield stage, partial(draw_curves, title=title, curves=curves, **options)
+                options = {"xlabel": stage.unit, "ylabel": ylabel, "log": log}
+                yield stage.title, partial(draw_curves, title=title, curves=curves, **options)
 
 
 def _swing_charts(judged: Judged, robot: str, end: float) -> list[Any]:
@@ -166,12 +167,10 @@ def _flat(config: Mapping, prefix: str = "") -> dict[str, Any]:
 def _changed(config: Mapping) -> list[tuple[str, Any, Any]]:
     """Fields that are not as the package has them by default: name, value, default."""
 
-    kinds = {
-        ("sac", "gradient", "snes"): TrainRun, ("sac", "snes"): TrainRun, ("sac",): SACRun,
-        ("gradient",): GradientRun, ("snes",): SNESRun,
-    }  # fmt: skip
-    kind = kinds.get(tuple(stage for stage in STAGES if stage in config))
-    default = _flat(to_mapping(kind(robot=config["robot"]))) if kind else {}
+    kinds = (SACRun, GradientRun, SNESRun, TrainRun)
+    fields = {kind: {field.name for field in dataclasses.fields(kind)} for kind in kinds}
+    kind = min(kinds, key=lambda kind: len(fields[kind] ^ config.keys()))
+    default = _flat(to_mapping(kind(robot=config["robot"]))) if config else {}
     return [
         (name, value, default.get(name, ""))
         for name, value in _flat(config).items()
@@ -218,11 +217,11 @@ def _draw(judged: Judged, robot: str, name: str, folder: Path) -> dict[str, list
     return drawn
 
 
-def _seed_table(runs: Sequence[Found], judged: Sequence[Judged | None]) -> list[dict]:
+def _seed_table(runs: Sequence[RunRecord], judged: Sequence[Judged | None]) -> list[dict]:
     """A row for every seed."""
     rows = []
     for run, found in zip(runs, judged, strict=True):
-        seconds = [stage.get("seconds") for stage in _stages(run).values()]
+        seconds = [stage.get("seconds") for stage in run.results.values()]
         rows.append(
             {
                 "name": run.name,
@@ -233,11 +232,6 @@ def _seed_table(runs: Sequence[Found], judged: Sequence[Judged | None]) -> list[
             }
         )
     return rows
-
-
-def _stages(run: Found) -> dict[str, dict]:
-    """What ``result.json`` says of each stage."""
-    return {title: run.result[key] for key, title in RESULTS.items() if key in (run.result or {})}
 
 
 def _summary(values: Sequence[float | None]) -> dict[str, float] | None:
@@ -251,7 +245,7 @@ def _summary(values: Sequence[float | None]) -> dict[str, float] | None:
     return {name: float(value) for name, value in summary.items()}
 
 
-def write(runs: Sequence[Found], folder: Path, *, title: str, robustness: bool = True) -> Path:
+def write(runs: Sequence[RunRecord], folder: Path, *, title: str, robustness: bool = True) -> Path:
     """Judge what the runs have left, and write ``report.html`` and the pictures of ``report/``.
 
     Args:
@@ -278,7 +272,7 @@ def write(runs: Sequence[Found], folder: Path, *, title: str, robustness: bool =
         "remarks": remarks(runs),
         "finished": all(run.result or not run.config for run in runs),
         "seeds": rows if len(runs) > 1 else [],
-        "stages": _stages(runs[0]) if len(runs) == 1 else {},
+        "stages": runs[0].results if len(runs) == 1 else {},
         "learning": [
             (stage, plots.svg(plots.panel(d), f"learning{k}", f"{stage}: {d.keywords['title']}"))
             for k, (stage, d) in enumerate(learning)
@@ -324,7 +318,7 @@ def _best(runs, judged, rows, shown: int, title: str) -> dict[str, Any]:
     }
 
 
-def _film(runs: Sequence[Found], judged: Sequence[Judged | None], shown: int) -> dict[str, Any]:
+def _film(runs: Sequence[RunRecord], judged: Sequence[Judged | None], shown: int) -> dict[str, Any]:
     """What the page plays: every seed that has a policy."""
     robot = runs[0].robot
     plant, joint = competition(robot), active_joint(robot)
