@@ -134,10 +134,10 @@ def read_result(path: Path) -> dict[str, Any] | None:
     if result is None and not path.exists():
         return None
     try:
-        parts = [part for part in _is(result, dict).values() if isinstance(part, dict)]
+        parts = {k: v for k, v in _is(result, dict).items() if k not in ("robot", "seed", "score")}
         sound = _number(result["score"])
-        for part in parts:
-            sound &= _number(part["score"]) and _number(part.get("seconds") or 0)
+        for part in parts.values():
+            sound &= _number(_is(part, dict)["score"]) and _number(part.get("seconds") or 0)
             if part.get("success"):
                 sound &= _number(_is(part["criteria"], dict)["swingup_time"])
         if sound:
@@ -180,9 +180,10 @@ def _guessed(config: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> li
         if not (_number(total) and total):
             continue
         keys = dict.fromkeys(key for row in rows if row.get("stage") == name for key in row)
-        column, *others = [k for k in keys if k not in ("stage", "seconds")] or ["step"]
+        column, *others = [key for key in keys if key not in ("stage", "seconds")] or ["step"]
         title = name.upper() if len(name) < 5 else name.capitalize()
-        charts = [(k.replace("_", " "), {k: k}, "", False) for k in others]
+        shown = [key for key in others if key not in ("rollbacks", "finite")]
+        charts = [(key.replace("_", " "), {key: key}, "", False) for key in shown]
         scores = [key for key in others if key in ("score", "mean_score", "individual_score")]
         heading = "" if name == "imitation" else f"after {title}"
         words = (name, title, column.replace("_", " "), column, total, heading)

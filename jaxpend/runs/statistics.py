@@ -60,6 +60,6 @@ def summary(results: Sequence[Mapping[str, Any]], headings: Mapping[str, str]) -
         "stages": {
             name: {"heading": heading} | _aggregate([result[name]["score"] for result in results])
             for name, heading in headings.items()
-            if name in results[0]
+            if all(name in result for result in results)
         },
     }
