@@ -18,7 +18,7 @@ ones fades from the gradient (``memory``).
 
 import math
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -169,7 +169,7 @@ class Gradient(SearchStage):
 
     name, title, unit, column = "gradient", "Gradient", "steps", "step"
     heading, scores = "after the gradient", ("score",)
-    charts: ClassVar = (
+    charts = (
         Chart("Official score", {"best so far": "best", "now": "score"}, "v2 score"),
         Chart("Smooth score", {"smooth score": "smooth_score"}, "of the nominal run"),
         Chart("Norm of the gradient", {"norm": "slope"}, log=True),

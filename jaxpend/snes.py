@@ -11,7 +11,7 @@ evosax stand behind the same options.
 
 import dataclasses
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -178,7 +178,7 @@ class SNES(SearchStage):
 
     name, title, unit, column = "snes", "SNES", "generations", "generation"
     heading, scores = "after SNES", ("mean_score", "individual_score")
-    charts: ClassVar = (
+    charts = (
         Chart("Fitness", {"mean": "mean_fitness", "best": "max_fitness"}, "noisy v2 score"),
         Chart("Official score", {"best so far": "best", "mean": "mean_score"}, "v2 score"),
         Chart("Standard deviation", {"sigma": "sigma"}, "of the parameters"),

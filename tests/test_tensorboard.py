@@ -1,10 +1,10 @@
 """TensorBoard events: the rows of the metrics, each once."""
 
 import json
-import struct
 import sys
 
 import pytest
+from training_runs import events_of
 
 from jaxpend import JaxpendError
 from jaxpend.config import SNESRun
@@ -25,19 +25,6 @@ SCALARS = [
 ]  # fmt: skip
 
 
-def scalars(run):
-    """(tag, step, value) of every scalar in the one event file of a run folder."""
-    from tensorboardX.proto.event_pb2 import Event
-
-    (path,) = (run / "tensorboard").glob("*.jaxpend")
-    data, found = path.read_bytes(), []
-    while data:  # TFRecord: length, its checksum, the event, its checksum
-        (size,) = struct.unpack("<Q", data[:8])
-        event, data = Event.FromString(data[12 : 12 + size]), data[16 + size :]
-        found += [(value.tag, event.step, value.simple_value) for value in event.summary.value]
-    return found
-
-
 def write(run, rows):
     """Rows of metrics as training leaves them."""
     (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
@@ -46,10 +33,10 @@ def write(run, rows):
 def test_every_row_is_on_disk_once_whatever_went_before(tmp_path):
     write(tmp_path, ROWS[:2])
     events = Events(tmp_path, COLUMNS)
-    assert scalars(tmp_path) == SCALARS[:5]
+    assert events_of(tmp_path) == SCALARS[:5]
     for row in ROWS[2:]:
         events.add(row)
-    assert scalars(tmp_path) == SCALARS
+    assert events_of(tmp_path) == SCALARS
     (path,) = (tmp_path / "tensorboard").iterdir()
     path.rename(path.with_name("events.out.tfevents.1.before.jaxpend"))
     own = tmp_path / "tensorboard" / "events.out.tfevents.1.mine"
@@ -58,7 +45,7 @@ def test_every_row_is_on_disk_once_whatever_went_before(tmp_path):
     events = Events(tmp_path, COLUMNS)
     for row in ROWS[1:]:
         events.add(row)
-    assert scalars(tmp_path) == SCALARS
+    assert events_of(tmp_path) == SCALARS
     assert own.read_text() == "mine"
 
 
@@ -68,7 +55,7 @@ def test_a_run_folder_writes_events_only_if_asked(tmp_path):
     folder = RunFolder(tmp_path / "asked", config, "command", about)
     for row in ROWS:
         folder.log(**{name: value for name, value in row.items() if value is not None})
-    assert scalars(folder.path) == SCALARS
+    assert events_of(folder.path) == SCALARS
     folder = RunFolder(tmp_path / "not", SNESRun(), "command")
     folder.log(**ROWS[2])
     assert not (folder.path / "tensorboard").exists()

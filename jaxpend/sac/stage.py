@@ -1,17 +1,16 @@
 """The stages of ``jaxpend sac``: imitation of demonstrations, and SAC itself."""
 
 from functools import partial
-from typing import ClassVar
 
 import jax
 
-from . import algorithm
 from ..boards import Task
 from ..config import SACConfig
 from ..controller import Controller
 from ..pytree import pytree
 from ..score import nominal
 from ..stage import Chart, Stage
+from . import algorithm
 from .algorithm import SACState
 from .demonstrations import Imitation as Learner
 
@@ -30,7 +29,7 @@ class Imitation(Stage[None, ImitationState, SACState]):
     """The actor imitates demonstrations."""
 
     name, title, unit, column = "imitation", "Imitation", "updates", "updates"
-    charts: ClassVar = (Chart("Squared error", {"loss": "loss"}, "of the action", True),)
+    charts = (Chart("Squared error", {"loss": "loss"}, "of the action", True),)
     CHUNK = 2000  # updates
 
     def __init__(self, config: SACConfig):
@@ -83,7 +82,7 @@ class SAC(Stage[SACState | None, SACState, Controller]):
 
     name, title, unit, column = "sac", "SAC", "environment steps", "env_steps"
     heading, scores = "after SAC", ("score",)
-    charts: ClassVar = (
+    charts = (
         Chart("Official score", {"best so far": "best", "now": "score"}, "v2 score"),
         Chart("Reward", {"reward": "reward"}, "mean of a step"),
         Chart("Temperature", {"temperature": "temperature"}, log=True),

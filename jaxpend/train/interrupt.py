@@ -36,7 +36,8 @@ def _ask(signum, _frame) -> None:
 def deferred() -> Iterator[None]:
     """Inside, SIGINT and SIGTERM only ask; ``stop_if_asked`` answers. A second one kills.
 
-    One that no loop has answered is answered at the end: it raises ``Stopped`` there. Outside the main thread, and for a signal that is ignored (a background job), nothing changes.
+    One that no loop has answered is answered at the end: it raises ``Stopped`` there. Outside the
+    main thread, and for a signal that is ignored (a background job), nothing changes.
     """
     before = {}
     for signum in (signal.SIGINT, signal.SIGTERM):
