@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import signal
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -93,18 +94,32 @@ def test_a_rollback_goes_on_from_the_last_chunk_with_another_key(tmp_path, monke
     assert rows[2]["reward"] != rows[3]["reward"]
 
 
-def test_sac_ends_at_its_budget_and_its_chunks_before_are_the_same(tmp_path):
-    """The budget is rounded up to whole steps of all environments."""
-    ends = {}
-    for steps in (96, 72, 65, 5):
-        small = dataclasses.replace(SMALL, steps=steps, final_learning_rate=1.0)
-        train(SACRun(run=f"{steps}", runs=str(tmp_path), sac=small))
-        rows = rows_of(tmp_path / f"{steps}", "sac")
-        ends[steps] = [row["env_steps"] for row in rows]
-        if steps > 5:
-            longer = rows_of(tmp_path / "96", "sac")
-            assert rows[:3] == longer[:3]
-    assert ends == {96: [0, 32, 64, 96], 72: [0, 32, 64, 72], 65: [0, 32, 64, 72], 5: [0, 8]}
+@pytest.mark.parametrize(
+    ("steps", "chunks"), [(96, [4, 4, 4]), (65, [4, 4, 1]), (33, [4, 1]), (32, [4]), (1, [1])]
+)
+def test_sac_ends_at_its_budget_in_whole_steps_of_all_environments(monkeypatch, steps, chunks):
+    def train_chunk(config, state, vector_steps):
+        found.append(vector_steps)
+        return state.replace(env_steps=state.env_steps + 8 * vector_steps), {}
+
+    monkeypatch.setattr(algorithm, "train_chunk", train_chunk)
+    found, small = [], dataclasses.replace(SMALL, steps=steps)
+    stage, state = SAC(small, TASK), SimpleNamespace(env_steps=0)
+    state.replace = lambda env_steps: SimpleNamespace(env_steps=env_steps, replace=state.replace)
+    while stage.done(state) < stage.total:
+        ((state, _),) = stage.advance([state])
+    assert found == chunks
+    assert stage.done(state) == 8 * sum(chunks) < steps + 8
+
+
+def test_a_shorter_last_chunk_changes_nothing_before_it(tmp_path):
+    for steps in (96, 65):
+        train(
+            SACRun(run=f"{steps}", runs=str(tmp_path), sac=dataclasses.replace(SMALL, steps=steps))
+        )
+    longer, shorter = (rows_of(tmp_path / run, "sac") for run in ("96", "65"))
+    assert [row["env_steps"] for row in shorter] == [0, 32, 64, 72]
+    assert shorter[:3] == longer[:3]
 
 
 def test_seeds_in_one_vmap_stop_resume_and_come_to_what_they_come_to_alone(tmp_path, monkeypatch):

@@ -97,7 +97,7 @@ def _json(path: Path) -> Any:
     """What a file says; None: there is no such file."""
     try:
         return json.loads(path.read_text())
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError, RecursionError):
         raise _Unreadable(path, "valid JSON") from None

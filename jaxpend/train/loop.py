@@ -57,29 +57,30 @@ def train_stage(stage: Stage, runs: Sequence[SeedRun]) -> None:
                 raise Stopped(stop.signum, f"stopped {behind[0].where(stage)}") from None
             least = min(stage.done(run.state) for run in behind)
             group = [run for run in behind if stage.done(run.state) == least]
+            before = runs[0].best_score
             after = stage.advance([run.state for run in group])
             rows = [run.take(stage, *done) for run, done in zip(group, after, strict=True)]
             if any(r.folder.seconds - r.saved >= r.config.checkpoint.every for r in group):
                 for run in running():
                     run.checkpoint()
             note = stage.note(rows[0]) if len(runs) == 1 else f"{len(group)} seeds"
-            note += best_so_far(stage, runs)
+            note += best_so_far(stage, runs, before)
             progress.report(min(stage.done(group[0].state), stage.total), note)
     for run in runs:
         if not run.failed:
             run.leave(stage)
 
 
-def best_so_far(stage: Stage, runs: Sequence[SeedRun]) -> str:
-    """The best score, for people; of one run, whether the last chunk has improved it."""
+def best_so_far(stage: Stage, runs: Sequence[SeedRun], before: float) -> str:
+    """The best score, for people; of one run, what the last chunk has made of ``before``."""
     best = float(np.median([run.best_score for run in runs]))
     if not math.isfinite(best):
         return ""
     if len(runs) > 1:
         return f"  median best {best:.4f}"
     at = runs[0].best_at
-    kept = "improved" if at == stage.done(runs[0].state) else f"kept since {at:,}"
-    return f"  best {best:.4f}, {kept}"
+    equalled = "equalled" if at == stage.done(runs[0].state) else f"kept since {at:,}"
+    return f"  best {best:.4f}, {'improved' if best > before else equalled}"
 
 
 def stages_of(
