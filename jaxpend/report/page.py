@@ -12,10 +12,9 @@ import jinja2
 import numpy as np
 
 from .. import __version__
-from ..boards import HEADINGS, PUBLISHED
+from ..boards import HEADINGS, v2
 from ..config import GradientRun, SACRun, SNESRun, TrainRun
-from ..controllers.files import load_controller
-from ..controllers.policy import read_header
+from ..controllers.files import load_controller, read_header
 from ..designs import competition
 from ..files import write_atomically
 from ..robots import active_joint
@@ -59,7 +58,7 @@ def judge(found: RunRecord, robustness: bool = True) -> Judged | None:
         return None
 
     with jax.enable_x64(True):
-        run, c = nominal_run(load_controller(found.policy, robot=found.robot), found.robot)
+        run, c = nominal_run(load_controller(found.policy, robot=found.robot), v2(found.robot).task)
         score = float(score_v2(c))
     report = None
     if robustness:
@@ -150,7 +149,7 @@ def _criteria(judged: Judged) -> list[dict]:
 def _board(robot: str, own: Sequence[tuple[str, float, float | None]]) -> list[dict]:
     """Published rows and our own, the best score first."""
 
-    rows = [(title, *numbers, False) for title, numbers in PUBLISHED[robot].items()]
+    rows = [(*row, False) for row in v2(robot).published]
     rows += [(*row, True) for row in own]
     names = ("title", "score", "robustness", "own")
     return [dict(zip(names, row, strict=True)) for row in sorted(rows, key=lambda r: -r[1])]

@@ -252,7 +252,7 @@ def find(run: Path) -> list[RunRecord]:
     Raises:
         JaxpendError: it is none of these, or cannot be read.
     """
-    from ..controllers.policy import read_header  # loads jax
+    from ..controllers.files import read_header  # loads jax
 
     if seeds := seed_folders(run):
         return [read_run(seed) for seed in seeds]
