@@ -14,12 +14,13 @@ from PIL import Image
 from jaxpend import cli, load_policy, save_policy
 from jaxpend.boards import v2
 from jaxpend.cli import commands
-from jaxpend.config import TrainRun
+from jaxpend.config import DemonstrationConfig, SACConfig, TrainRun
 from jaxpend.controllers.policy import network_in
 from jaxpend.report import page
-from jaxpend.runs import record as report
+from jaxpend.runs import reader as report
 from jaxpend.runs.folder import to_mapping
 from jaxpend.score import official
+from jaxpend.train.loop import stages_of
 
 # Characters that mean something in HTML must not.
 NAME = "odd <i> & \"co\""  # fmt: skip
@@ -33,8 +34,10 @@ def sac(steps, score, **more):
 def make_run(folder, rows, *, policy="policy.npz", result=True, **config):
     """A run folder as training leaves it, with the policy that ships as its policy."""
     folder.mkdir(parents=True)
-    config = to_mapping(TrainRun(robot="pendubot", **config))
-    (folder / "config.json").write_text(json.dumps(config))
+    run = TrainRun(robot="pendubot", **config)
+    (folder / "config.json").write_text(json.dumps(to_mapping(run)))
+    stages = stages_of(run, None, v2("pendubot").task).values()
+    (folder / "run.json").write_text(json.dumps({"stages": [stage.about() for stage in stages]}))
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     if policy:
         made_by = {"command": "python -m jaxpend.train --seed <7>", "version": "0.0.7"}
@@ -177,12 +180,17 @@ def test_seeds_keep_their_axis(tmp_path):
     assert text.count("<option value=") == 2 + 4
 
 
+def curve(run, name, column):
+    (stage,) = (stage for stage in run.stages if stage.name == name)
+    return page._curve(run, stage, column)
+
+
 def test_curves_know_the_best_so_far_through_all_stages(made):
     (run,) = report.find(made.folder)
-    x, y = page._curve(run, "sac", "best")
+    x, y = curve(run, "sac", "best")
     assert (x.tolist(), y.tolist()) == ([0, 25_000, 50_000], [0.1, 0.4, 0.4])
-    assert page._curve(run, "snes", "best")[1].tolist() == [0.4, 0.4]
-    assert [len(page._curve(run, "sac", name)[0]) for name in ("temperature", "critic_loss")] == [
+    assert curve(run, "snes", "best")[1].tolist() == [0.4, 0.4]
+    assert [len(curve(run, "sac", name)[0]) for name in ("temperature", "critic_loss")] == [
         1,
         0,
     ]
@@ -191,11 +199,11 @@ def test_curves_know_the_best_so_far_through_all_stages(made):
 def test_what_went_wrong_is_said(tmp_path):
     rows = [{"stage": "imitation", "updates": 20, "loss": 0.1}, sac(0, 0.2)]
     rows += [sac(25, 0.9, finite=0, rollbacks=1), sac(50, 0.1, rollbacks=1)]
-    folder = make_run(tmp_path / "hard", rows, result=False)
-    config = json.loads((folder / "config.json").read_text())
-    config["sac"]["demonstrations"] |= {"episodes": 3, "updates": 20}
-    (folder / "config.json").write_text(json.dumps(config))
-    (folder / "run.json").write_text('{"command": "jaxpend train --seed 5", "version": "0.9"}')
+    shown = SACConfig(demonstrations=DemonstrationConfig(episodes=3, updates=20))
+    folder = make_run(tmp_path / "hard", rows, result=False, sac=shown)
+    about = json.loads((folder / "run.json").read_text())
+    about |= {"command": "jaxpend train --seed 5", "version": "0.9"}
+    (folder / "run.json").write_text(json.dumps(about))
     (run,) = report.find(folder)
     first, second = report.remarks([run])
     assert first.startswith(
@@ -203,8 +211,8 @@ def test_what_went_wrong_is_said(tmp_path):
     )
     assert second == "hard diverged and went back to its last good state 1 time."
     # What diverged is no best score.
-    assert page._curve(run, "sac", "best")[1].tolist() == [0.2, 0.2]
-    assert page._curve(run, "imitation", "loss")[1].tolist() == [0.1]
+    assert curve(run, "sac", "best")[1].tolist() == [0.2, 0.2]
+    assert curve(run, "imitation", "loss")[1].tolist() == [0.1]
     assert run.made_by["command"] == "jaxpend train --seed 5"
 
 
@@ -213,6 +221,20 @@ def test_rows_that_came_twice_count_once_in_order(tmp_path):
     folder = make_run(tmp_path / "resumed", rows)
     found = [(row["env_steps"], row["score"]) for row in report.find(folder)[0].rows]
     assert found == [(25, 0.2), (50, 0.3)]
+
+
+def test_a_run_of_version_0_1_has_a_page(tmp_path):
+    """Its run.json says nothing of its stages."""
+    rows = [sac(0, 0.1), sac(25, 0.4, temperature=0.1)]
+    rows += [{"stage": "snes", "generation": 9, "mean_score": 0.35, **SNES}]
+    folder = make_run(tmp_path / "old", rows)
+    (folder / "run.json").write_text('{"version": "0.1.0", "command": "jaxpend train --seed 3"}')
+    (run,) = report.find(folder)
+    assert curve(run, "sac", "best")[1].tolist() == [0.1, 0.4]
+    commands.report(folder, robustness=False)
+    text = (folder / "report.html").read_text()
+    for words in ("jaxpend train --seed 3", "SAC: temperature", "SNES: mean fitness", "after SAC"):
+        assert words in text
 
 
 def test_policies_can_be_shown_without_a_run(tmp_path, monkeypatch):
@@ -238,6 +260,14 @@ def test_policies_can_be_shown_without_a_run(tmp_path, monkeypatch):
         (
             lambda folder: make_run(folder, []).joinpath("config.json").write_text("[]"),
             "is not the",
+        ),
+        (
+            lambda folder: make_run(folder, []).joinpath("run.json").write_text('{"stages": [3]}'),
+            "run.json is not what a run says of itself; the run cannot be read",
+        ),
+        (
+            lambda folder: make_run(folder, []).joinpath("result.json").write_text('{"score": ""}'),
+            "result.json is not the result of a run; the run cannot be read",
         ),
         (lambda folder: make_run(folder, []).joinpath("policy.npz").write_bytes(b""), "cut off"),
         (lambda folder: folder.write_text("text"), "is not a policy file"),
