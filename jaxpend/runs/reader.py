@@ -297,12 +297,21 @@ def _locked(folder: Path) -> bool:
     return False
 
 
+def _changed(folder: Path) -> str:
+    """When a file in it was last written, as ISO 8601."""
+    times = [folder.stat().st_mtime]
+    with contextlib.suppress(OSError):
+        for path in folder.iterdir():
+            with contextlib.suppress(OSError):  # it is gone already
+                times.append(path.lstat().st_mtime)
+    newest = max(times[1:], default=times[0])
+    return datetime.datetime.fromtimestamp(newest).astimezone().isoformat(timespec="seconds")
+
+
 def _entry(folder: Path) -> dict[str, Any]:
     """One run folder as plain values; ``state`` is finished, running, interrupted or broken."""
     about = {"run": folder.name, "robot": None, "stages": [], "seed": None, "state": "broken"}
-    newest = max((p.lstat().st_mtime for p in folder.iterdir()), default=0.0)
-    changed = datetime.datetime.fromtimestamp(newest).astimezone().isoformat(timespec="seconds")
-    about |= {"at": None, "score": None, "seconds": None, "changed": changed}
+    about |= {"at": None, "score": None, "seconds": None, "changed": _changed(folder)}
     try:
         config = _config(folder)
         seed = config.get("seed")

@@ -32,13 +32,13 @@ class Imitation(Stage[None, ImitationState, SACState]):
     charts = (Chart("Squared error", {"loss": "loss"}, "of the action", True),)
     CHUNK = 2000  # updates
 
-    def __init__(self, config: SACConfig):
-        self.config, self.total = config, config.demonstrations.updates
+    def __init__(self, config: SACConfig, task: Task):
+        self.config, self.task, self.total = config, task, config.demonstrations.updates
 
     @classmethod
     def of(cls, run, start, task):
         config = getattr(run, "sac", None)
-        return cls(config) if config and config.demonstrations.episodes else None
+        return cls(config, task) if config and config.demonstrations.episodes else None
 
     def start(self, seed, before):
         return ImitationState(*algorithm.begin(self.config, jax.random.key(seed)))

@@ -86,10 +86,11 @@ class SeedRun:
         """Begin a stage with what the one before it came to."""
         before = self.start if self.outcome is None else self.outcome
         self.state = stage.start(self.config.seed, before)
+        self.outcome = None  # with its replay buffer
         self.stage, self.best, self.best_score, self.best_at = stage.name, None, -math.inf, 0
         row, candidates = stage.judge(self.state, {})
         self._keep_best(stage, candidates)
-        if "score" in row:
+        if "score" in row:  # a point to begin the curves with
             self.folder.log(stage.name, **{stage.column: stage.done(self.state)}, **row)
 
     def take(self, stage: Stage, state: Any, metrics: dict) -> dict:
