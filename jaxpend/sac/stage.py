@@ -7,7 +7,7 @@ import jax
 from ..boards import Task
 from ..config import SACConfig
 from ..controller import Controller
-from ..pytree import pytree
+from ..pytree import Pytree, pytree
 from ..score import nominal
 from ..stage import Chart, Stage
 from . import algorithm
@@ -18,7 +18,7 @@ __all__ = ["SAC", "Imitation", "ImitationState"]
 
 
 @pytree
-class ImitationState:
+class ImitationState(Pytree):
     """SAC before its first step, and the actor that imitates."""
 
     sac: SACState

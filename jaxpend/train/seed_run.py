@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from ..boards import Board
 from ..config import Run
 from ..controller import Controller
+from ..pytree import Pytree
 from ..runs.checkpoints import Checkpoints
 from ..runs.folder import RunFolder
 from ..score import official
@@ -30,7 +31,7 @@ class SeedRun:
     board: Board
     start: Controller | None = None  # what a user has it start from
     stage: str = ""  # name of the stage it is in
-    state: Any = None  # of the stage it is in: its ``State``
+    state: Pytree | None = None  # of the stage it is in: its ``State``
     outcome: Any = None  # of the stage before, for the next one: its ``After``
     best: Controller | None = None  # by the official score; None in a stage without policies
     best_score: float = -math.inf
