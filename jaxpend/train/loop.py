@@ -144,11 +144,13 @@ def train(
             opened.enter_context(folder)
             checkpoints = Checkpoints(folder.path / "checkpoints", one.checkpoint.keep)
             runs.append(SeedRun(one, folder, checkpoints, Board("v2", task), start))
-        waiting = [run for run in runs if run.folder.result is None]
+        waiting = []
         for run in runs:
-            if run not in waiting:
-                score = run.folder.result["score"]
-                console.print(f"{run.folder.path} is finished: score {score:.4f}", soft_wrap=True)
+            if (result := run.folder.result) is None:
+                waiting.append(run)
+                continue
+            text = f"{run.folder.path} is finished: score {result['score']:.4f}"
+            console.print(text, soft_wrap=True)
         try:
             with deferred():
                 for group in [waiting] if vmap else [[run] for run in waiting]:

@@ -133,6 +133,7 @@ class SeedRun:
                 self._save_best(stage)
 
     def _save_best(self, stage: Stage) -> None:
+        assert self.best is not None
         self._save(f"{stage.name}_best.npz", self.best, stage, self.best_at)
 
     def _save(self, name: str, policy: Controller, stage: Stage, at: int) -> None:
@@ -152,6 +153,7 @@ class SeedRun:
 
     def finish(self) -> None:
         """All stages are done: the policy and the result; the checkpoints have done their job."""
+        assert self.best is not None
         score = self.result["score"]
         self.folder.save("policy.npz", self.best, seed=self.config.seed, score=score)
         self.folder.write_json("result.json", self.result)
