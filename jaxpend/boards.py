@@ -7,12 +7,13 @@ judges takes one. So training cannot touch official keys or grids, and another b
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
 from . import designs
+from .controller import robot_of
 from .criteria import HEIGHT, Criteria, ScoreV2, criteria
 from .errors import JaxpendError, choose
 from .plant import Plant
@@ -23,7 +24,19 @@ from .variations import RANGES, sample
 if TYPE_CHECKING:
     from .rollout import Trajectory
 
-__all__ = ["CRITERIA", "HEADINGS", "V2", "Board", "Strip", "Task", "board", "strips", "v2"]
+__all__ = [
+    "CRITERIA",
+    "HEADINGS",
+    "V2",
+    "Board",
+    "Strip",
+    "Task",
+    "board",
+    "own_task",
+    "strips",
+    "task_of",
+    "v2",
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,6 +196,40 @@ def v2(robot: str) -> Board:
     return V2[choose("robot", robot, V2)]
 
 
+def own_task(controller: Any, task: Task | None = None) -> Task:
+    """``task``, or where there is none that of the v2 board of the robot a controller is for.
+
+    Raises:
+        JaxpendError: the controller does not say which robot it is for.
+    """
+    if task is not None:
+        return task
+    robot = robot_of(controller)
+    if robot is None:
+        name = type(controller).__name__
+        raise JaxpendError(f"{name} does not know its robot; give a task, as v2(robot).task")
+    return v2(robot).task
+
+
 def board(robot_or_board: "str | Board") -> Board:
     """A board itself, or by a robot's name its v2 board."""
     return robot_or_board if isinstance(robot_or_board, Board) else v2(robot_or_board)
+
+
+def task_of(robot: str, plant: str | None = "", design: str | None = "") -> Task:
+    """The v2 task of a robot, on another plant where one is named; the torque limit stays 6 N m.
+
+    Args:
+        robot: "acrobot" or "pendubot".
+        plant: file of parameters (``designs.read``); empty or None: none.
+        design: name of an identified set (``designs.parameters``); empty or None: none.
+
+    Raises:
+        JaxpendError: an unknown robot or design, both given, or a file that cannot be used.
+    """
+    task = v2(robot).task
+    if plant and design:
+        raise JaxpendError(f"plant {plant} and design {design} are both given; there is one plant")
+    if plant:
+        return task.of(designs.read(plant))
+    return task.of(designs.parameters(design)) if design else task

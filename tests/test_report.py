@@ -15,10 +15,10 @@ from jaxpend import cli, load_policy, save_policy
 from jaxpend.boards import v2
 from jaxpend.cli import commands
 from jaxpend.config import DemonstrationConfig, SACConfig, TrainRun
+from jaxpend.config_files import to_mapping
 from jaxpend.controllers.policy import network_in
 from jaxpend.report import page
 from jaxpend.runs import reader as report
-from jaxpend.runs.folder import to_mapping
 from jaxpend.score import official
 from jaxpend.train.loop import stages_of
 

@@ -14,12 +14,12 @@ import numpy as np
 from .. import __version__
 from ..boards import HEADINGS, v2
 from ..config import GradientRun, SACRun, SNESRun, TrainRun
+from ..config_files import to_mapping
 from ..controllers.files import load_controller, read_header
 from ..designs import competition
 from ..files import write_atomically
 from ..robots import active_joint
 from ..robustness import CRITERIA, benchmark
-from ..runs.folder import to_mapping
 from ..runs.reader import RunRecord, StageRecord, remarks
 from ..runs.statistics import interquartile_mean, interval
 from ..score import V2_OFFICIAL, nominal_run, score_v2

@@ -29,7 +29,6 @@ __all__ = [
     "read_result",
     "read_run",
     "remarks",
-    "runs_table",
     "seed_folders",
 ]
 
@@ -374,34 +373,3 @@ def listing(folder: str | Path) -> list[dict[str, Any]]:
     if not entries:
         raise JaxpendError(f"there are no runs in {folder}; jaxpend train makes runs")
     return entries
-
-
-def runs_table(entries: Sequence[Mapping[str, Any]]) -> None:
-    """Print runs, a row each, on standard error like all tables."""
-    from rich import box
-    from rich.table import Table
-
-    from ..terminal import console
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("run", "robot", "stages", "seed", "state", "score", "time", "changed"):
-        right = heading in ("score", "time")
-        table.add_column(heading, justify="right" if right else "left", overflow="fold")
-    colours = {"finished": "green", "running": "cyan", "interrupted": "yellow", "broken": "red"}
-    groups = False
-    for run in entries:
-        groups |= "runs" in run
-        seed = f"{len(run['seed'])} seeds" if "runs" in run else run["seed"]
-        state = f"[{colours[run['state']]}]{run['state']}[/]"
-        date = datetime.datetime.fromisoformat(run["changed"])
-        table.add_row(
-            run["run"], run["robot"] or "", ", ".join(s.upper() for s in run["stages"]),
-            "" if seed is None else str(seed),
-            f"{state}: {run['at']}" if run["at"] else state,
-            "" if run["score"] is None else f"{run['score']:.4f}",
-            "" if run["seconds"] is None else f"{run['seconds']:.0f} s",
-            f"{date:%d %b %H:%M}",
-        )  # fmt: skip
-    console.print(table)
-    if groups:
-        console.print("the score of several seeds is the median of those finished", style="dim")
