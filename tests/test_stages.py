@@ -1,13 +1,14 @@
 """Stages: what candidates are compared by, and that a new stage is one class."""
 
 import dataclasses
+import json
 import signal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import shipped_network
+from conftest import refused, shipped_network
 from training_runs import events_of, rows_of
 
 from jaxpend import Policy, save_policy, stage
@@ -180,3 +181,21 @@ def test_progress_says_whether_the_best_is_new(tmp_path, capfd):
     said = [line for line in capfd.readouterr().err.splitlines() if line.startswith("Shrinking ")]
     notes = [line.partition("  best ")[2] for line in said]
     assert notes == ["0.1000, improved", "0.2000, improved", "0.2000, kept since 2"]
+
+
+def test_a_plant_file_that_has_changed_makes_another_run(tmp_path):
+    save_policy(tmp_path / "start.npz", shipped_network())
+    plant, parameters = tmp_path / "plant.json", dict(TASK.parameters)
+    plant.write_text(json.dumps(parameters))
+    run = SNESRun(policy=str(tmp_path / "start.npz"), runs=str(tmp_path), run="heavy")
+    run = dataclasses.replace(run, plant=str(plant))
+    train(run, kinds=(Shrinking,))
+    folder = tmp_path / "heavy"
+    assert json.loads((folder / "run.json").read_text())["plant"] == parameters
+    (folder / "result.json").unlink()
+    moved = plant.rename(tmp_path / "moved.json")
+    train(dataclasses.replace(run, plant=str(moved)), kinds=(Shrinking,))  # the same plant
+    name = next(iter(parameters))
+    moved.write_text(json.dumps(parameters | {name: 2 * parameters[name]}))
+    with refused(f"{folder} holds a run with plant.{name} {parameters[name]}, not"):
+        train(dataclasses.replace(run, plant=str(moved)), kinds=(Shrinking,))
