@@ -65,10 +65,10 @@ def bench_seeds(count: int = 4) -> None:
     config = dataclasses.replace(recipe.sac, demonstrations=shown, eval_every=3200)
     task = v2(recipe.robot).task
     search = SNES(dataclasses.replace(recipe.snes, chunk=2), random_policy(64), task)
-    training = SAC(config, task)
+    agent, training = sac.Agent(config, task), SAC(config, task)
     keys = [jax.random.key(seed) for seed in range(count)]
     parts = {
-        "SAC": (training, [sac.init(config, key) for key in keys]),
+        "SAC": (training, [sac.init(agent, key) for key in keys]),
         "SNES": (search, [search.start(seed, random_policy(64)) for seed in range(count)]),
     }
     for name, (stage, states) in parts.items():
@@ -113,12 +113,13 @@ def bench_mpc() -> None:
 def bench_sac() -> None:
     """Updates and steps of SAC."""
     config = sac.SACConfig(warmup_steps=0)
-    state = sac.init(config, jax.random.key(0))
+    agent = sac.Agent(config, v2("pendubot").task)
+    state = sac.init(agent, jax.random.key(0))
     vector_steps = 250
 
     def chunk():
         nonlocal state
-        state, metrics = sac.train_chunk(config, state, vector_steps)
+        state, metrics = sac.train_chunk(agent, state, vector_steps)
         return metrics
 
     times = timed(chunk)

@@ -5,13 +5,14 @@ import json
 import signal
 from types import SimpleNamespace
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from training_runs import arrays_of, result_of, rows_of
 
-from jaxpend import JaxpendError, Policy, load_policy, sac, snes
+from jaxpend import JaxpendError, Policy, load_policy, snes
 from jaxpend.boards import v2
 from jaxpend.config import EnvConfig, SACConfig, SACRun, SNESConfig
 from jaxpend.observation import Observation
@@ -37,9 +38,9 @@ def poison(monkeypatch, *poisoned):
     """Let the calls of these numbers of a chunk return a temperature that is not a number."""
     chunk, calls = algorithm.train_chunk, []
 
-    def train_chunk(config, state, steps):
+    def train_chunk(agent, state, steps):
         calls.append(state)
-        state, metrics = chunk(config, state, steps)
+        state, metrics = chunk(agent, state, steps)
         if len(calls) in poisoned:
             state = state.replace(log_temperature=state.log_temperature * jnp.nan)
         return state, metrics
@@ -63,8 +64,9 @@ def test_divergence_stops_with_the_last_good_state_on_disk(tmp_path, capfd, monk
     assert text.startswith(f"{start} {tmp_path / 'run' / 'checkpoints'}, the best policy beside")
     assert "--on-divergence rollback" in text
     assert [(row["env_steps"], row.get("finite", 1)) for row in rows] == [(0, 1), (32, 1), (64, 0)]
+    stage = SAC(SMALL, TASK)
     found, about = Checkpoints(tmp_path / "run" / "checkpoints").newest(
-        lambda about: {"state": sac.structure(SMALL)[0], "best": SAC(SMALL, TASK).policy_like()}
+        lambda about: {"state": stage.like(), "best": stage.policy_like()}
     )
     assert (int(found["state"].env_steps), about["stage"]) == (32, "sac")
     assert all_finite(found["state"])
@@ -89,7 +91,7 @@ def test_a_rollback_goes_on_from_the_last_chunk_with_another_key(tmp_path, monke
         (32, 1, 0), (64, 0, 0), (64, 1, 1), (96, 1, 1),
     ]  # fmt: skip
     before, after = calls[1:3]
-    np.testing.assert_array_equal(before.replay.rows, after.replay.rows)
+    chex.assert_trees_all_equal(before.replay, after.replay)
     assert not np.array_equal(*(jax.random.key_data(s.key) for s in (before, after)))
     assert rows[2]["reward"] != rows[3]["reward"]
 

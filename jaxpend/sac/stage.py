@@ -12,7 +12,7 @@ from ..pytree import Pytree, pytree
 from ..score import nominal
 from ..stage import Chart, Stage
 from . import algorithm
-from .algorithm import SACState
+from .algorithm import Agent, SACState
 from .demonstrations import Imitation as Learner
 
 __all__ = ["SAC", "Imitation", "ImitationState"]
@@ -34,7 +34,7 @@ class Imitation(Stage[None, ImitationState, SACState]):
     CHUNK = 2000  # updates
 
     def __init__(self, config: SACConfig, task: Task):
-        self.config, self.task, self.total = config, task, config.demonstrations.updates
+        self.agent, self.total = Agent(config, task), config.demonstrations.updates
 
     @classmethod
     def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
@@ -42,10 +42,10 @@ class Imitation(Stage[None, ImitationState, SACState]):
         return cls(config, task) if config and config.demonstrations.episodes else None
 
     def start(self, seed: int, before: None) -> ImitationState:
-        return self._state(*algorithm.begin(self.config, jax.random.key(seed)))
+        return self._state(*algorithm.begin(self.agent, jax.random.key(seed)))
 
     def like(self) -> ImitationState:
-        return self._state(*algorithm.structure(self.config))
+        return self._state(*algorithm.structure(self.agent))
 
     @staticmethod
     def _state(state: SACState, learner: Learner | None) -> ImitationState:
@@ -62,7 +62,7 @@ class Imitation(Stage[None, ImitationState, SACState]):
         count = min(self.CHUNK, self.total - self.done(states[0]))
         after = []
         for state in states:
-            learner, loss = algorithm.imitate_chunk(self.config, state.sac, state.learner, count)
+            learner, loss = algorithm.imitate_chunk(self.agent, state.sac, state.learner, count)
             after.append((state.replace(learner=learner), {"loss": loss}))
         return after
 
@@ -101,7 +101,7 @@ class SAC(Stage[SACState | None, SACState, Controller]):
     ties = True  # they happen before the first success: the later policy has learned more
 
     def __init__(self, config: SACConfig, task: Task):
-        self.config, self.task, self.total = config, task, config.steps
+        self.agent, self.task, self.total = Agent(config, task), task, config.steps
         self.vector_steps = max(config.eval_every // config.num_envs, 1)
 
     @classmethod
@@ -112,29 +112,29 @@ class SAC(Stage[SACState | None, SACState, Controller]):
     def start(self, seed: int, before: SACState | None) -> SACState:
         if before is not None:
             return before
-        return algorithm.begin(self.config, jax.random.key(seed))[0]
+        return algorithm.begin(self.agent, jax.random.key(seed))[0]
 
     def like(self) -> SACState:
-        return algorithm.structure(self.config)[0]
+        return algorithm.structure(self.agent)[0]
 
     def policy_like(self) -> Controller | None:
-        return jax.eval_shape(partial(algorithm.greedy_policy, self.config), self.like())
+        return jax.eval_shape(partial(algorithm.greedy_policy, self.agent), self.like())
 
     def done(self, state: SACState) -> int:
         return int(state.env_steps)
 
     def advance(self, states: list[SACState]) -> list[tuple[SACState, dict[str, Any]]]:
         # The last chunk is as long as what is left, in whole steps of all environments.
-        left = -(-(self.total - self.done(states[0])) // self.config.num_envs)
+        left = -(-(self.total - self.done(states[0])) // self.agent.config.num_envs)
         steps = min(self.vector_steps, left)
         if len(states) == 1:
-            return [algorithm.train_chunk(self.config, states[0], steps)]
-        return algorithm.train_chunks(self.config, states, steps)
+            return [algorithm.train_chunk(self.agent, states[0], steps)]
+        return algorithm.train_chunks(self.agent, states, steps)
 
     def judge(
         self, state: SACState, metrics: dict[str, Any]
     ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
-        policy = algorithm.greedy_policy(self.config, state)
+        policy = algorithm.greedy_policy(self.agent, state)
         c = nominal(policy, self.task)
         score = float(self.task.score(c))
         row = {"updates": int(state.updates), "score": score, "uptime": c.uptime, **metrics}
