@@ -1,20 +1,21 @@
 """Pictures, and the CSV and JSON files beside them. Imported only by commands that draw.
 
 A chart is a function that draws on the axes it is given: alone, the width of a phone, for the
-page of a report (``panel`` and ``svg``), or beside others for a PNG file (``stack``).
+page of a report (``panel`` and ``svg``), or beside others for a PNG file (``stack``). Figures are
+objects that only this package holds: matplotlib's backend and the user's settings stay as they are.
 """
 
 import csv
 import io
 import json
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import matplotlib
-
-matplotlib.use("Agg")
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -25,6 +26,7 @@ from ..variations import VARIATIONS
 __all__ = [
     "PALETTE",
     "map_figure",
+    "medians",
     "panel",
     "robustness_figure",
     "save",
@@ -61,7 +63,10 @@ styled = matplotlib.rc_context(STYLE)
 def save(figure: Figure, path: Path, dpi: int = 150) -> None:
     """Write a figure as PNG, atomically."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
+    with warnings.catch_warnings():
+        # A name may have characters that the font does not have; boxes stand for them.
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        figure.savefig(buffer, format="png", dpi=dpi)
     write_atomically(path, buffer.getvalue())
 
 
@@ -104,19 +109,27 @@ def stack(
     figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
     for number, draw in enumerate(draws):
         draw(figure.add_subplot(rows, columns, number + 1))
-    figure.suptitle(title, fontweight="bold")
+    figure.suptitle(title, fontweight="bold", parse_math=False)
     return figure
 
 
 # --- robustness ----------------------------------------------------------------------------
 
 
+def medians(result: dict[str, Any]) -> tuple[float, dict[str, float]]:
+    """The overall robustness and that of every criterion: medians over the keys of a result."""
+    over = result["over_keys"]
+    scores = {n: median(over["scores"].get(n, [score])) for n, score in result["scores"].items()}
+    return median(over["overall"]), scores
+
+
 def _bars(axes, result: dict[str, Any], first: bool) -> None:
-    """The six scores and the overall one, with the range over keys as whiskers."""
+    """The six scores and the overall one: medians over keys, with the range as whiskers."""
     over, names = result["over_keys"], list(reversed(CRITERIA))
+    overall, scores = medians(result)
     titles = ["Overall", *(CRITERIA[name] for name in names)]
-    values = [result["overall"], *(result["scores"][name] for name in names)]
-    ranges = [over["overall"], *(over["scores"].get(n, [result["scores"][n]]) for n in names)]
+    values = [overall, *(scores[name] for name in names)]
+    ranges = [over["overall"], *(over["scores"].get(n, [scores[n]]) for n in names)]
     colours = [PALETTE["ink"]] + [PALETTE["one"]] * len(CRITERIA)
     axes.barh(range(len(values)), values, color=colours, height=0.7)
     for y, (value, spread) in enumerate(zip(values, ranges, strict=True)):
