@@ -12,7 +12,7 @@ from ..controllers.files import load_controller
 from ..controllers.policy import read_header
 from ..plant import forward_kinematics
 from ..robustness import benchmark
-from ..runs.record import RunRecord
+from ..runs.reader import RunRecord
 from ..score import nominal_run
 from .figures import medians
 

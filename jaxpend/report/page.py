@@ -15,7 +15,7 @@ from .. import __version__, boards
 from ..boards import Board
 from ..files import write_atomically
 from ..robustness import CRITERIA
-from ..runs.record import RunRecord, remarks
+from ..runs.reader import RunRecord, StageRecord, remarks
 from ..runs.statistics import interquartile_mean, interval
 from . import figures
 from .animation import gif, keyframes
@@ -24,55 +24,43 @@ from .judged import Judged, criteria_costs, judge
 
 __all__ = ["write"]
 
-# Columns of the metrics that hold official scores.
-SCORES = ("score", "mean_score", "individual_score")
 LABELS = tuple(f"{what} over time" for what in ("angles", "velocities", "torque", "height"))
 
 
 # --- learning ------------------------------------------------------------------------------
 
 
-def _curve(run: RunRecord, stage: str, column: str) -> tuple[np.ndarray, np.ndarray]:
+def _curve(run: RunRecord, stage: StageRecord, column: str) -> tuple[np.ndarray, np.ndarray]:
     """Two arrays: what is on x and on y, where the column has a number.
 
     The column "best" is the best official score so far, those of earlier stages included.
     """
-    columns = {known.name: known.column for known in run.stages}
-    order, top, points = list(columns), -math.inf, []
-    good = [row for row in run.rows if row.get("finite") != 0 and row["stage"] in columns]
-    for row in sorted(good, key=lambda row: order.index(row["stage"])):
-        top = max([top, *(row[name] for name in SCORES if _is_number(row.get(name)))])
+    scores = {known.name: known.scores for known in run.stages}
+    top, points = -math.inf, []
+    for row in run.rows:
+        if row.get("finite") == 0:
+            continue
+        top = max([top, *(row[name] for name in scores[row["stage"]] if name in row)])
         y = top if column == "best" else row.get(column)
-        if row["stage"] == stage and _is_number(y):
-            points.append((row[columns[stage]], y))
+        if row["stage"] == stage.name and y is not None and math.isfinite(y):
+            points.append((row[stage.column], y))
     return np.array([x for x, _ in points]), np.array([y for _, y in points])
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def _learning(runs: Sequence[RunRecord]) -> Iterator[tuple[str, Any]]:
     """Title of a stage, and a chart: a function of axes. Of several runs, the first column."""
-    for stage in runs[0].stages:
+    # Seeds have the same stages; of an old run that has just begun, not all charts are known.
+    for stage in max((run.stages for run in runs), key=lambda s: sum(len(x.charts) for x in s)):
         for title, columns, ylabel, log in stage.charts:
             shown = list(columns.items())
             if len(runs) > 1:
                 title += f", {shown[0][0]}" * (len(shown) > 1)
                 shown = shown[:1]
-            curves = {label: [_curve(run, stage.name, name) for run in runs] for label, name in shown}
+            curves = {label: [_curve(run, stage, name) for run in runs] for label, name in shown}
             curves = {k: v for k, v in curves.items() if any(len(x) for x, _ in v)}
             if curves:
                 options = {"xlabel": stage.unit, "ylabel": ylabel, "log": log}
                 yield stage.title, partial(draw_curves, title=title, curves=curves, **options)
-
-
-def _results(run: RunRecord) -> dict[str, dict]:
-    """What ``result.json`` says of each stage, by the stage's heading."""
-    result = run.result or {}
-    headings = {"start": "start"} | {stage.name: stage.heading for stage in run.stages}
-    found = {heading: result.get(name) for name, heading in headings.items()}
-    return {k: v for k, v in found.items() if isinstance(v, dict) and _is_number(v.get("score"))}
 
 
 # --- the swing-up ----------------------------------------------------------------------------
@@ -165,7 +153,7 @@ def _seed_table(runs: Sequence[RunRecord], judged: Sequence[Judged | None]) -> l
     """A row for every seed."""
     rows = []
     for run, found in zip(runs, judged, strict=True):
-        seconds = [stage.get("seconds") for stage in _results(run).values()]
+        seconds = [stage.get("seconds") for stage in run.results.values()]
         rows.append(
             {
                 "name": run.name,
@@ -190,6 +178,14 @@ def _summary(values: Sequence[float | None]) -> dict[str, float] | None:
 
 
 # --- writing -------------------------------------------------------------------------------
+
+
+def _board(run: RunRecord) -> Board:
+    """The v2 board of a run's robot; of a run on a plant of its own, on that, and unpublished."""
+    official = boards.v2(run.robot)
+    if not run.plant or run.plant == dict(official.task.parameters):
+        return official
+    return Board(f"{official.name}, own plant", official.task.of(run.plant))
 
 
 def _legible(text: str) -> str:
@@ -221,7 +217,7 @@ def write(
     """
     pictures, title = folder / "report", _legible(title)
     runs = [dataclasses.replace(run, name=_legible(run.name)) for run in runs]
-    board = boards.v2(runs[0].robot) if board is None else board
+    board = _board(runs[0]) if board is None else board
     judged = [judge(run, board, keys if robustness else 0) for run in runs]
     rows = _seed_table(runs, judged)
     shown = max((k for k, j in enumerate(judged) if j), key=lambda k: judged[k].score, default=None)
@@ -233,7 +229,10 @@ def write(
         sheet = figures.stack([draw for _, draw in learning], columns=3, title=heading)
         figures.save(sheet, pictures / "learning.png")
         context["learning"] = [
-            (stage, figures.svg(figures.panel(d), f"learning{k}", f"{stage}: {d.keywords['title']}"))
+            (
+                stage,
+                figures.svg(figures.panel(d), f"learning{k}", f"{stage}: {d.keywords['title']}"),
+            )
             for k, (stage, d) in enumerate(learning)
         ]
     if shown is not None:
@@ -251,23 +250,22 @@ def write(
     return path
 
 
-def _about(
-    runs: Sequence[RunRecord], rows: list[dict], board: Board, title: str
-) -> dict[str, Any]:
+def _about(runs: Sequence[RunRecord], rows: list[dict], board: Board, title: str) -> dict[str, Any]:
     """What the page says of the runs, whether there is a policy or not."""
-    changed = runs[0].made_by.get("changed", {})
     return {
         "title": title,
         "robot": board.robot,
         "board": board.name,
+        "published": bool(board.published),
+        "score_name": f"{'official ' * bool(board.published)}{board.name} score",
         "height": board.task.height,
         "duration": board.task.duration,
         "rate": round(1 / board.task.dt),
         "remarks": remarks(runs),
         "finished": all(run.result or not run.config for run in runs),
         "seeds": rows if len(runs) > 1 else [],
-        "stages": _results(runs[0]) if len(runs) == 1 else {},
-        "config": [{"name": n, "value": v, "default": d} for n, (v, d) in changed.items()],
+        "stages": runs[0].results if len(runs) == 1 else {},
+        "config": [{"name": n, "value": v, "default": d} for n, (v, d) in runs[0].changed.items()],
         "whole_config": _flat(runs[0].config),
         "versions": {"jaxpend": __version__, "jax": jax.__version__, "numpy": np.__version__},
     }
