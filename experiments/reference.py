@@ -10,6 +10,7 @@ import inspect
 import pkgutil
 import re
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +20,9 @@ import jaxpend
 from jaxpend.files import write_atomically
 
 OUT = Path(__file__).parent.parent / "build" / "docs"
+# Where jax.Array is defined, in the pages; nobody writes it so.
+INTERNAL = '<span class="n">jaxlib</span><span class="o">.</span><span class="n">_jax</span>'
+INTERNAL += '<span class="o">.</span>'
 
 
 def module_names() -> list[str]:
@@ -37,10 +41,20 @@ def describe(known: doc.Class) -> None:
 
 
 def main(folder: Path = OUT, names: Sequence[str] = ()) -> None:
-    """Write the pages."""
+    """Write the pages. What pdoc complains of is an error, so that it does not go unseen."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        # optax's type of its states names one that only optax knows.
+        warnings.filterwarnings("ignore", "Error parsing type annotation .*ArrayTree", UserWarning)
+        write(folder, names)
+    print(f"the reference is {folder / 'index.html'}", file=sys.stderr)
+
+
+def write(folder: Path, names: Sequence[str]) -> None:
+    """Write the pages of some modules, or of all."""
     names = list(names) or module_names()
     for name in jaxpend.__all__:
-        getattr(jaxpend, name)  # they are imported when they are first asked for
+        setattr(jaxpend, name, getattr(jaxpend, name))  # pdoc looks for what is there already
     modules = {name: doc.Module(importlib.import_module(name)) for name in names}
     for name, module in modules.items():
         inside = [n for n in names if n.startswith(f"{name}.") and "." not in n[len(name) + 1 :]]
@@ -49,11 +63,10 @@ def main(folder: Path = OUT, names: Sequence[str] = ()) -> None:
             describe(known)
     render.configure(docformat="google", footer_text=f"jaxpend {jaxpend.__version__}")
     for name, module in modules.items():
-        page = folder / f"{name.replace('.', '/')}.html"
-        write_atomically(page, render.html_module(module, modules))
+        page = render.html_module(module, modules).replace(INTERNAL, "").replace("jaxlib._jax.", "")
+        write_atomically(folder / f"{name.replace('.', '/')}.html", page)
     write_atomically(folder / "index.html", render.html_index(modules))
     write_atomically(folder / "search.js", render.search_index(modules))
-    print(f"the reference is {folder / 'index.html'}", file=sys.stderr)
 
 
 if __name__ == "__main__":
