@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpend import Scenario, load_policy, rollout
+from jaxpend import Scenario, load_policy, rollout, sac, save_policy, snes
 from jaxpend.boards import v2
+from jaxpend.config import SACConfig, SNESConfig
 from jaxpend.controllers import guard, load_reference, lqr
 from jaxpend.controllers.search_space import FACTOR
 from jaxpend.plant import UPRIGHT, deviation, dynamics, forward_kinematics, total_energy
@@ -101,6 +102,33 @@ values = {
 found = survey(plant, guarded, values, jax.random.key(1))
 print("1: it stands after 10 s. A row for each mass, a column for each delay")
 print(found.success.astype(int))
+
+# %% SNES: what a controller declares in SEARCHED is improved, here the gain
+# The fitness is the mean of the score and of the scores in random imperfect scenarios. A budget as
+# small as this one shows how, and no more.
+config = SNESConfig(
+    generations=2 if SHORT else 20, population=4 if SHORT else 16, scenarios=2 if SHORT else 8
+)
+search = snes.init(config, mine, jax.random.key(2))
+search, history = snes.evolve(config, mine, search, config.generations, task)
+print("mean fitness, from generation to generation:", np.round(history["mean_fitness"], 3))
+tuned = snes.best_controller(config, mine, search)
+print(f"the score was 0.7004 and is {official(tuned, board)['score']:.4f}")
+
+# %% SAC: a policy learns from the reward alone
+# All that stays the same is in the agent, all that changes in the state. A Python loop over chunks
+# gives progress; jaxpend train adds checkpoints, the best policy and a folder for the run.
+width = (32, 32) if SHORT else (256, 256)
+agent = sac.Agent(
+    SACConfig(num_envs=16, actor_hidden=width, critic_hidden=width, warmup_steps=500), task
+)
+state = sac.init(agent, jax.random.key(3))
+for _ in range(2 if SHORT else 20):
+    state, metrics = sac.train_chunk(agent, state, vector_steps=50)
+    print(f"{int(state.env_steps):,} steps, mean reward {float(metrics['reward']):.3f}")
+learned = sac.greedy_policy(agent, state)
+print(f"score after so little: {official(learned, board)['score']:.4f}")
+save_policy(OUT / "learned.npz", learned)  # load_policy reads it, and every command takes it
 
 # %% Looking at it: charts draw on the axes they are given
 from jaxpend.report import charts, figures  # noqa: E402  matplotlib, only where it is needed
