@@ -18,12 +18,12 @@ from .errors import JaxpendError, choose
 from .plant import Plant
 from .robots import ROBOTS, active_joint
 from .scenario import Scenario
-from .variations import sample
+from .variations import RANGES, sample
 
 if TYPE_CHECKING:
     from .rollout import Trajectory
 
-__all__ = ["HEADINGS", "V2", "Board", "Task", "board", "v2"]
+__all__ = ["CRITERIA", "HEADINGS", "V2", "Board", "Strip", "Task", "board", "strips", "v2"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,12 +91,52 @@ class Task:
         return dataclasses.replace(self, parameters=values)
 
 
+# The six criteria of robustness in the order of the boards, and their headings there.
+CRITERIA = {
+    "model": "Model",
+    "velocity_noise": "Velocity noise",
+    "torque_noise": "Torque noise",
+    "responsiveness": "Torque step response",
+    "delay": "Time delay",
+    "perturbation": "Perturbations",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Strip:
+    """One row of grid values of one criterion of robustness."""
+
+    criterion: str
+    variation: str  # name in ``VARIATIONS``
+    values: np.ndarray  # (n,) SI units
+    repetitions: int = 1
+
+
+def strips(plant: Plant) -> list[Strip]:
+    """The grids of the v2 boards around a nominal plant: 15 strips, 722 runs."""
+    nominal = {name: np.asarray(value, float) for name, value in vars(plant).items()}
+    m, r, inertia = nominal["mass"], nominal["com"], nominal["inertia"]
+    grid = {name: np.linspace(*ends, 21) for name, ends in RANGES.items()}
+    around = {"m1r1": m[0] * r[0], "I1": inertia[0], "m2r2": m[1] * r[1], "m2": m[1]}
+    around |= {"I2": inertia[1]}
+    model = ("Ir", "m1r1", "I1", "b1", "cf1", "m2r2", "m2", "I2", "b2", "cf2")
+    return [
+        *(Strip("model", name, grid[name] * around.get(name, 1.0)) for name in model),
+        Strip("velocity_noise", "velocity_noise", grid["velocity_noise"], 10),
+        Strip("torque_noise", "torque_noise", grid["torque_noise"], 10),
+        Strip("responsiveness", "responsiveness", grid["responsiveness"]),
+        Strip("delay", "delay", grid["delay"]),
+        Strip("perturbation", "perturbation", np.ones(50)),
+    ]
+
+
 @dataclasses.dataclass(frozen=True)
 class Board:
     """A task with its official trials and the rows that are published."""
 
     name: str
     task: Task
+    trials: Callable[[Plant], list[Strip]] = strips  # of robustness, around the nominal plant
     published: tuple[tuple[str, float, float], ...] = ()  # title, performance, robustness
 
     @property
@@ -132,7 +172,10 @@ _PUBLISHED = {
         ("iLQR Riccati gains", 0.536, 0.255),
     ),
 }
-V2 = {robot: Board("v2", Task(robot, designs.COMPETITION), _PUBLISHED[robot]) for robot in ROBOTS}
+V2 = {
+    robot: Board("v2", Task(robot, designs.COMPETITION), published=_PUBLISHED[robot])
+    for robot in ROBOTS
+}
 
 
 def v2(robot: str) -> Board:

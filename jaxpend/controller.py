@@ -1,14 +1,28 @@
-"""The controller protocol, and the simplest controllers on it."""
+"""The controller protocol, what checks it, and the simplest controllers on it."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from .errors import JaxpendError, blame
 from .pytree import pytree, static
+from .robots import ROBOTS
 
-__all__ = ["Controller", "Feedback", "OpenLoop", "Zero"]
+__all__ = [
+    "Controller",
+    "Feedback",
+    "Memoryless",
+    "OpenLoop",
+    "Zero",
+    "check_controller",
+    "check_form",
+    "check_robot",
+    "robot_of",
+]
 
 
 class Controller(Protocol):
@@ -21,6 +35,99 @@ class Controller(Protocol):
     def __call__(self, carry: Any, t: jax.Array, x: jax.Array) -> tuple[Any, jax.Array]:
         """New memory and torque (2,), N m, from memory, time (s) and measured state (4,)."""
         ...
+
+
+HOW = (
+    "a controller is a jaxpend.pytree.pytree dataclass with reset(key) -> carry and "
+    "__call__(carry, t, x) -> (carry, torque (2,))"
+)
+
+
+def check_form(controller: Any) -> None:
+    """Refuse what is no controller by its form; cheap enough for every call of ``rollout``.
+
+    Raises:
+        JaxpendError: no ``reset``, not callable, a class instead of an instance, or not a pytree
+            of arrays and numbers.
+    """
+    name = controller.__name__ if isinstance(controller, type) else type(controller).__name__
+    if isinstance(controller, type):
+        raise JaxpendError(f"{name} is a class, not an instance of it; {HOW}")
+    if not callable(getattr(controller, "reset", None)) or not callable(controller):
+        raise JaxpendError(f"{name} is no controller; {HOW}")
+    for leaf in jax.tree.leaves(controller):
+        if leaf is controller:
+            raise JaxpendError(f"{name} is not a pytree, so jax cannot trace it; {HOW}")
+        if not isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int):
+            what = type(leaf).__name__
+            if not isinstance(leaf, jax.ShapeDtypeStruct):
+                raise JaxpendError(f"{name} holds a {what} where an array should be; {HOW}")
+
+
+def check_controller(controller: Any) -> None:
+    """Refuse what would end in a traceback of jax later; the check at every door but ``rollout``.
+
+    A controller with a method ``check`` is asked too.
+
+    Raises:
+        JaxpendError: as ``check_form``; an array with NaN in it; it raises when it is called; or
+            it does not return its memory, of the same form as before, and a torque (2,).
+    """
+    check_form(controller)
+    name = type(controller).__name__
+    try:
+        hash(jax.tree.structure(controller))
+    except TypeError as error:
+        raise JaxpendError(f"{name} has a static field that cannot be hashed: {error}") from None
+    for leaf in jax.tree.leaves(controller):
+        if isinstance(leaf, jax.core.Tracer | jax.ShapeDtypeStruct):
+            continue
+        if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) and np.isnan(leaf).any():
+            raise JaxpendError(f"{name} holds a number that is NaN; all of them must be numbers")
+
+    if hasattr(controller, "check"):
+        controller.check()
+
+    def first_call(controller: Any) -> Any:
+        carry = controller.reset(jax.random.key(0))
+        return carry, controller(carry, jnp.zeros(()), jnp.zeros(4))
+
+    try:
+        carry, returned = jax.eval_shape(first_call, controller)
+    except JaxpendError:
+        raise
+    except Exception as error:
+        raise JaxpendError(f"{name} cannot be called: {blame(error)}") from error
+    if not (isinstance(returned, tuple) and len(returned) == 2):
+        raise JaxpendError(f"{name} returns {type(returned).__name__}, not (carry, torque)")
+    after, torque = returned
+    if getattr(torque, "shape", None) != (2,):
+        shape = getattr(torque, "shape", type(torque).__name__)
+        raise JaxpendError(f"{name} returns a torque of shape {shape}; it must be (2,)")
+    forms = [
+        (jax.tree.structure(tree), [leaf.shape for leaf in jax.tree.leaves(tree)])
+        for tree in (carry, after)
+    ]
+    if forms[0] != forms[1]:
+        raise JaxpendError(f"{name} returns a memory of another form than that of its reset")
+
+
+def robot_of(controller: Any) -> str | None:
+    """The robot that a controller, or a part of it, says that it is for; None: it says nothing."""
+    robot = getattr(controller, "robot", None)
+    if isinstance(robot, str) and robot in ROBOTS:
+        return robot
+    if not dataclasses.is_dataclass(controller):
+        return None
+    parts = (getattr(controller, field.name) for field in dataclasses.fields(controller))
+    return next((robot for part in parts if (robot := robot_of(part))), None)
+
+
+def check_robot(controller: Any, robot: str) -> None:
+    """Raise ``JaxpendError`` for a controller that says that it is for the other robot."""
+    its = robot_of(controller)
+    if its is not None and its != robot:
+        raise JaxpendError(f"this controller is for the {its}, not for the {robot}")
 
 
 class Memoryless:

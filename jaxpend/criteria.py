@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from .errors import JaxpendError
-from .plant import Plant
+from .plant import Plant, tip_height
 from .pytree import pytree
 
 __all__ = [
@@ -120,9 +120,7 @@ def criteria(
             f"got t {t.shape}, x {x.shape}, u {u.shape}"
         )
     t, x = t[..., :n], x[..., :n, :]
-    l1, l2 = plant.length[0], plant.length[1]
-    y = -l1 * jnp.cos(x[..., 0]) - l2 * jnp.cos(x[..., 0] + x[..., 1])
-    up = y > height * (l1 + l2)
+    up = tip_height(plant.length, x) > height * (plant.length[0] + plant.length[1])
     dt, held, moves = jnp.diff(t), u[..., :-1, :], jnp.diff(x[..., :2], axis=-2)
     stamps = jnp.broadcast_to(t, up.shape)
     index = _swingup_index(up)

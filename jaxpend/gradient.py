@@ -2,12 +2,12 @@
 
 The closed loop is differentiated from end to end: what a parameter does to the score seconds
 later is known, not sampled. Adam (Kingma and Ba, 2015) climbs from a trained policy, or from any
-other controller that declares what may be searched (``controllers/parameters.py``),
+other controller that declares what may be searched (``controllers/search_space.py``),
 
     (1 - w) smooth v2 score of the nominal run + w mean upright time of random scenarios
 
 The first is that of ``swingup.py``. The second is there only with ``config.scenarios``: the mean
-over a run and over imperfect scenarios (``randomisation.sample``, new ones every step) of
+over a run and over imperfect scenarios (``variations.sample``, new ones every step) of
 ``1 / (1 + d^2)``, d the distance to upright in units of what the benchmark calls a success.
 
 Where motion is chaotic the gradient explodes and says nothing. Therefore the window is
@@ -25,21 +25,19 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from . import designs
+from .boards import Task
 from .config import GradientConfig
-from .controller import Controller
+from .controller import Controller, check_controller
 from .controllers.search_space import coordinates
+from .criteria import EPSILON
 from .plant import rk4_step
 from .pytree import pytree
 from .rollout import rollout
 from .scenario import Scenario
-from .sweep import EPSILON
 from .trajopt.swingup import SwingUp, smooth_score, totals
-from .variations import LONGEST_DELAY, sample
+from .variations import LONGEST_DELAY
 
 __all__ = ["GradientConfig", "GradientState", "current", "improve", "init", "slope"]
-
-DT = 0.002  # s, the official one: smoothness and delay are counted in its steps
 
 
 @pytree
@@ -63,13 +61,12 @@ def _fading(memory: float):
     return rk4_step if math.isinf(memory) else integrate
 
 
-def performance(config: GradientConfig, controller: Controller, robot: str) -> jax.Array:
-    """Smooth v2 score of the first ``config.duration`` s of the nominal run."""
-    plant, joint = designs.competition(robot), designs.active_joint(robot)
-    run = rollout(plant, controller, jax.random.key(0), dt=DT, duration=config.duration)
+def performance(config: GradientConfig, controller: Controller, task: Task) -> jax.Array:
+    """Smooth score of the first ``config.duration`` s of the nominal run."""
+    run = rollout(task.plant, controller, jax.random.key(0), dt=task.dt, duration=config.duration)
     width = jnp.asarray(config.line_width), jnp.asarray(config.power_width)
-    p = SwingUp(plant, None, None, *width, joint=joint, dt=DT)
-    return smooth_score(p, totals(p, run.x, run.u[:, joint]))
+    p = SwingUp(task.plant, None, None, *width, task=task, dt=task.dt)
+    return smooth_score(p, totals(p, run.x, run.u[:, task.joint]))
 
 
 def uprightness(x: jax.Array) -> jax.Array:
@@ -79,11 +76,13 @@ def uprightness(x: jax.Array) -> jax.Array:
     return 1 / (1 + jnp.sum(off / jnp.asarray(EPSILON, x.dtype) ** 2, axis=-1))
 
 
-def robustness(config: GradientConfig, controller, scenario: Scenario, key) -> jax.Array:
+def robustness(
+    config: GradientConfig, controller: Controller, scenario: Scenario, key: jax.Array, task: Task
+) -> jax.Array:
     """Mean uprightness of a run of ``config.scenario_duration`` s; ``key`` is consumed."""
     slots, integrator = LONGEST_DELAY + 1, _fading(config.memory)
     options = {"duration": config.scenario_duration, "integrator": integrator}
-    run = rollout(scenario, controller, key, dt=DT, delay_slots=slots, **options)
+    run = rollout(scenario, controller, key, dt=task.dt, delay_slots=slots, **options)
     return uprightness(run.x).mean()
 
 
@@ -95,21 +94,20 @@ def _usable(config: GradientConfig, value, slope):
     return jnp.where(finite, value, 0.0), jnp.where(finite, scale * slope, 0.0), finite
 
 
-def slope(config: GradientConfig, start: Controller, robot: str, z: jax.Array, key: jax.Array):
+def slope(config: GradientConfig, start: Controller, task: Task, z: jax.Array, key: jax.Array):
     """Gradient (n,) at the coordinates ``z`` (n,), how many runs were lost, and metrics.
 
     ``start`` is the origin of the coordinates; ``key`` is consumed.
     """
     rebuild = coordinates(start, config.searched)[-1]
-    found = jax.value_and_grad(lambda z: performance(config, rebuild(z), robot))(z)
+    found = jax.value_and_grad(lambda z: performance(config, rebuild(z), task))(z)
     value, ascent, finite = _usable(config, *found)
     lost, metrics = 1 - finite.astype(jnp.int32), {"smooth_score": value}
     if not config.scenarios:
         return ascent, lost, metrics
-    plant = designs.competition(robot)
     keys = jax.random.split(key, 2 * config.scenarios)
-    scenarios = jax.vmap(lambda k: sample(plant, k))(keys[: config.scenarios])
-    each = jax.value_and_grad(lambda z, s, k: robustness(config, rebuild(z), s, k))
+    scenarios = jax.vmap(task.sample)(keys[: config.scenarios])
+    each = jax.value_and_grad(lambda z, s, k: robustness(config, rebuild(z), s, k, task))
     found = jax.vmap(each, in_axes=(None, 0, 0))(z, scenarios, keys[config.scenarios :])
     values, ascents, finite = jax.vmap(partial(_usable, config))(*found)
     weight, kept = config.scenario_weight, jnp.maximum(finite.sum(), 1)
@@ -121,7 +119,8 @@ def slope(config: GradientConfig, start: Controller, robot: str, z: jax.Array, k
 def _adam(config: GradientConfig, weights: np.ndarray) -> optax.GradientTransformation:
     """Adam, warmed up, then with cosine decay; weights and all else have step sizes of their own.
 
-    Its first steps are as long as all others whatever the gradient: cold, they fell off a cliff.
+    Adam's first steps are as long as all others, however small the gradient; without a warm-up
+    they lost the swing-up.
     """
     rates = np.where(weights, config.learning_rate, config.gain_learning_rate)
     decay = optax.warmup_cosine_decay_schedule(
@@ -132,15 +131,16 @@ def _adam(config: GradientConfig, weights: np.ndarray) -> optax.GradientTransfor
 
 
 def init(config: GradientConfig, controller: Controller, key: jax.Array) -> GradientState:
-    """At the controller, before the first step. Raises as ``parameters.kinds``."""
+    """At the controller, before the first step. Raises as ``search_space.kinds``."""
+    check_controller(controller)
     z, weights, _ = coordinates(controller, config.searched)
     return GradientState(z, _adam(config, weights).init(z), key, jnp.zeros((), jnp.int32))
 
 
-@partial(jax.jit, static_argnames=("config", "steps", "robot"))
+@partial(jax.jit, static_argnames=("config", "steps", "task"))
 def improve(
-    config: GradientConfig, start: Controller, state: GradientState, steps: int, robot: str
-):
+    config: GradientConfig, start: Controller, state: GradientState, steps: int, task: Task
+) -> tuple[GradientState, dict[str, jax.Array]]:
     """Some Adam steps; returns the state and metrics of each step (steps,).
 
     ``start`` is what ``init`` got: the origin of the coordinates, and all that is not searched.
@@ -149,7 +149,7 @@ def improve(
 
     def step(state, _):
         key, key_now = jax.random.split(state.key)
-        ascent, lost, metrics = slope(config, start, robot, state.parameters, key_now)
+        ascent, lost, metrics = slope(config, start, task, state.parameters, key_now)
         change, memory = optimizer.update(ascent, state.optimizer)
         state = GradientState(state.parameters + change, memory, key, state.lost + lost)
         return state, metrics | {"slope": jnp.linalg.norm(ascent)}

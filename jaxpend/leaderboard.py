@@ -5,80 +5,77 @@ benchmark in float32, as ``jaxpend robustness`` runs it.
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import jax
 
-from . import designs
-from .boards import HEADINGS, PUBLISHED
+from .boards import HEADINGS, Board
+from .controller import Controller
 from .controllers.catalogue import CATALOGUE, build
-from .controllers.files import load_controller
-from .controllers.policy import load_policy
+from .controllers.files import load_controller, load_policy
 from .errors import JaxpendError, choose
-from .robustness import CRITERIA, benchmark
+from .plant import Plant
+from .robustness import CRITERIA, KEYS, benchmark
 from .score import official
 from .terminal import console
 
-__all__ = ["judge", "leaderboard", "markdown", "published"]
+__all__ = ["chosen", "judge", "leaderboard", "markdown", "published", "show"]
+
+Make = Callable[[Plant], Controller]
 
 # Headings for a terminal, in the order of ``HEADINGS`` and of ``CRITERIA``.
 SHORT = ("up s", "J", "torque²", "steps", "speed²")
 SHORT_ROBUSTNESS = ("model", "vel.", "torque", "resp.", "delay", "pulses")
 
 
-def published(robot: str) -> list[dict[str, Any]]:
-    """The rows of the boards: title, score and robustness."""
+def published(board: Board) -> list[dict[str, Any]]:
+    """The published rows of a board: title, score and robustness."""
     return [
         {"title": title, "source": "published", "score": score, "robustness": robustness}
-        for title, (score, robustness) in PUBLISHED[robot].items()
+        for title, score, robustness in board.published
     ]
 
 
 def judge(
-    make, robot: str, *, robustness: bool = True, keys: int = 1, seed: int = 0
+    make: Make, board: Board, *, robustness: bool = True, keys: int = KEYS, seed: int = 0
 ) -> dict[str, Any]:
     """Performance (float64) and robustness (float32) of a controller, as plain numbers.
 
     Args:
         make: called as ``make(plant)`` under either precision; gives the controller.
-        robot: "acrobot" or "pendubot".
+        board: to judge it on.
         robustness: run the benchmark too: seconds for a feedback law, minutes for MPC.
-        keys, seed: of ``robustness.benchmark``; of several keys it is the median that counts.
+        keys, seed: of ``robustness.benchmark``.
     """
     with jax.enable_x64(True):
-        result = official(make(designs.competition(robot)), robot)
+        result = official(make(board.task.plant), board)
     result = {name: result[name] for name in ("score", "success", "criteria")}
     if not robustness:
         return result | {"robustness": None}
     start = time.perf_counter()
     with jax.enable_x64(False):
-        plant = designs.competition(robot)
-        found = benchmark(make(plant), plant, jax.random.key(seed), keys=keys)
-    six = {
-        name: median(found.scores_by_key.get(name, [score])) for name, score in found.scores.items()
-    }
+        found = benchmark(make(board.task.plant), board, jax.random.key(seed), keys=keys)
     return result | {
-        "robustness": median(found.overall_by_key),
+        "robustness": found.overall,
         "robustness_by_key": found.overall_by_key,
-        "robustness_criteria": six,
+        "robustness_criteria": found.scores,
         "robustness_seconds": time.perf_counter() - start,
     }
 
 
 def leaderboard(
-    robot: str,
-    controllers: Mapping[str, tuple[str, Any]],
+    board: Board,
+    controllers: Mapping[str, tuple[str, Make]],
     *,
-    say=lambda line: None,
+    say: Callable[[str], None] = lambda line: None,
     **options: Any,
 ) -> dict[str, Any]:
     """Judge controllers, and rank them with the published ones by performance.
 
     Args:
-        robot: "acrobot" or "pendubot".
+        board: to judge them on.
         controllers: name -> (title, ``make(plant)``).
         say: told what is being judged.
         options: of ``judge``.
@@ -87,15 +84,18 @@ def leaderboard(
     for name, (title, make) in controllers.items():
         say(f"judging {title} ...")
         rows.append(
-            {"name": name, "title": title, "source": "measured"} | judge(make, robot, **options)
+            {"name": name, "title": title, "source": "measured"} | judge(make, board, **options)
         )
-    rows += published(robot)
-    return {"robot": robot, "rows": sorted(rows, key=lambda row: -row["score"])}
+    rows += published(board)
+    return {"robot": board.robot, "rows": sorted(rows, key=lambda row: -row["score"])}
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
     """A row as text: title, score, criteria, six robustness scores, robustness."""
-    shown = lambda value, form: "" if value is None else format(value, form)  # noqa: E731
+
+    def shown(value: float | None, form: str) -> str:
+        return "" if value is None else format(value, form)
+
     criteria = row.get("criteria") if row.get("success") else None
     criteria = criteria or dict.fromkeys(HEADINGS)
     six = row.get("robustness_criteria") or dict.fromkeys(CRITERIA)
@@ -165,6 +165,8 @@ def chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[str
         names = [n for n in CATALOGUE if not n.startswith("policy") or _ships_policy(robot)]
     else:
         names = [name.strip() for name in controllers.split(",") if name.strip()]
+        if not names:
+            raise JaxpendError(f"there is no controller to judge; known: {', '.join(CATALOGUE)}")
     chosen = {
         name: (
             CATALOGUE[choose("controller", name, CATALOGUE)].title,

@@ -21,8 +21,10 @@ import numpy as np
 from .pytree import pytree
 
 __all__ = [
+    "UPRIGHT",
     "Plant",
     "coriolis_matrix",
+    "deviation",
     "dynamics",
     "euler_step",
     "forward_kinematics",
@@ -33,9 +35,11 @@ __all__ = [
     "mass_matrix",
     "potential_energy",
     "rk4_step",
+    "tip_height",
     "total_energy",
 ]
 
+UPRIGHT = (np.pi, 0.0, 0.0, 0.0)
 # Steepness (s/rad) of the arctan that stands for the sign function in Coulomb friction.
 COULOMB_STEEPNESS = 100.0
 
@@ -171,6 +175,18 @@ def forward_kinematics(plant: Plant, x: jax.Array) -> jax.Array:
     end_x = elbow_x + plant.length[1] * jnp.sin(x[0] + x[1])
     end_y = elbow_y - plant.length[1] * jnp.cos(x[0] + x[1])
     return jnp.stack([jnp.stack([elbow_x, elbow_y]), jnp.stack([end_x, end_y])])
+
+
+def tip_height(length: jax.Array, x: jax.Array) -> jax.Array:
+    """Height of the end effector above joint 1, m, of states (..., 4): shape (...)."""
+    return -length[0] * jnp.cos(x[..., 0]) - length[1] * jnp.cos(x[..., 0] + x[..., 1])
+
+
+def deviation(x: jax.Array, goal: jax.Array) -> jax.Array:
+    """``x - goal``, (4,), with the angles wrapped to [-pi, pi)."""
+    turn = 2 * jnp.pi
+    angle = jnp.remainder(x[:2] - goal[:2] + jnp.pi, turn) - jnp.pi
+    return jnp.concatenate([angle, x[2:] - goal[2:]])
 
 
 def linearize(plant: Plant, x: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:

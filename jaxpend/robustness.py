@@ -10,104 +10,78 @@ edge of failure and no more; ``precision="float64"`` is the reference's arithmet
 
 import concurrent.futures
 import dataclasses
+import statistics
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
-from .controller import Controller
+from .boards import CRITERIA, Board, Strip, board, strips
+from .controller import Controller, check_robot
 from .errors import JaxpendError, choose
 from .plant import Plant
-from .scenario import Pulses, Scenario
+from .scenario import DT, DURATION, Pulses, Scenario
 from .sweep import compile_sweep, survey, sweep
-from .variations import vary
+from .variations import INERTIAL, RANGES, VARIATIONS, vary
 
-__all__ = ["CRITERIA", "Report", "Strip", "benchmark", "passes", "strips"]
+__all__ = [
+    "CRITERIA",
+    "KEYS",
+    "Report",
+    "Strip",
+    "benchmark",
+    "nominal_and_worst",
+    "passes",
+    "strips",
+    "success_map",
+]
 
-# The six criteria in the order of the boards, and their headings there.
-CRITERIA = {
-    "model": "Model",
-    "velocity_noise": "Velocity noise",
-    "torque_noise": "Torque noise",
-    "responsiveness": "Torque step response",
-    "delay": "Time delay",
-    "perturbation": "Perturbations",
-}
-# Those that draw something: repeated for every key.
-RANDOM = ("velocity_noise", "torque_noise", "perturbation")
-
-
-@dataclasses.dataclass(frozen=True)
-class Strip:
-    """One row of grid values of one criterion."""
-
-    criterion: str
-    variation: str  # name in ``VARIATIONS``
-    values: np.ndarray  # (n,) SI units
-    repetitions: int = 1
-
-
-def strips(plant: Plant) -> list[Strip]:
-    """The official grids around a nominal plant: 15 strips, 722 runs."""
-    nominal = {name: np.asarray(value, float) for name, value in vars(plant).items()}
-    m, r, inertia = nominal["mass"], nominal["com"], nominal["inertia"]
-    scale, damping = np.linspace(0.75, 1.25, 21), np.linspace(-0.1, 0.1, 21)
-    friction = np.linspace(-0.2, 0.2, 21)
-    model = {
-        "Ir": np.linspace(0, 1e-4, 21),
-        "m1r1": scale * (m[0] * r[0]), "I1": scale * inertia[0], "b1": damping, "cf1": friction,
-        "m2r2": scale * (m[1] * r[1]), "m2": scale * m[1], "I2": scale * inertia[1],
-        "b2": damping, "cf2": friction,
-    }  # fmt: skip
-    return [
-        *(Strip("model", name, values) for name, values in model.items()),
-        Strip("velocity_noise", "velocity_noise", np.linspace(0, 0.5, 21), 10),
-        Strip("torque_noise", "torque_noise", np.linspace(0, 1.1, 21), 10),
-        Strip("responsiveness", "responsiveness", np.linspace(0.1, 2, 21)),
-        Strip("delay", "delay", np.linspace(0, 0.04, 21)),
-        Strip("perturbation", "perturbation", np.ones(50)),
-    ]
+KEYS = 3  # by default; of one key, runs at the edge move the robustness by up to 0.03
 
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What the benchmark found. Dicts go by criterion or, for grids, by variation."""
+    """What the benchmark found. Dicts go by criterion or, for grids, by the name of the grid.
 
-    overall: float  # mean of the scores
+    What is drawn is drawn for several keys; every score here is the median over them.
+    """
+
+    overall: float  # median over keys of the mean of the scores
     scores: dict[str, float]  # criterion -> fraction of its grid values that pass
-    grids: list[Strip]
-    success: dict[str, np.ndarray]  # variation -> (values,) fraction of the repetitions
-    performance: dict[str, np.ndarray] | None  # variation -> (values,) mean v2 score
-    diverged: dict[str, int]  # criterion -> runs that diverged
-    overall_by_key: list[float]  # the first one is ``overall``
+    grids: dict[str, Strip]
+    success: dict[str, np.ndarray]  # grid -> (values,) fraction of the repetitions, first key
+    performance: dict[str, np.ndarray] | None  # grid -> (values,) mean v2 score, first key
+    diverged: dict[str, int]  # criterion -> runs that diverged, first key
+    overall_by_key: list[float]
     scores_by_key: dict[str, list[float]]  # of the criteria that draw something
-    simulations: int  # of one benchmark
+    simulations: int  # of one key
     compile_seconds: float
     run_seconds: float  # of all keys
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and dicts: what the command writes as JSON."""
         by_key = np.array(self.overall_by_key)
-        criteria = {
+        criteria: dict[str, Any] = {
             name: {"score": score, "diverged": self.diverged[name], "grids": {}}
             for name, score in self.scores.items()
         }
-        for strip in self.grids:
-            grid = {"values": strip.values.tolist()}
-            grid["success"] = self.success[strip.variation].tolist()
+        for name, strip in self.grids.items():
+            grid: dict[str, Any] = {"variation": strip.variation, "values": strip.values.tolist()}
+            grid["success"] = self.success[name].tolist()
             if self.performance is not None:
-                grid["performance"] = self.performance[strip.variation].tolist()
-            criteria[strip.criterion]["grids"][strip.variation] = grid
-        summary = {
-            "mean": by_key.mean(),
-            "std": by_key.std(),
-            "min": min(by_key),
-            "max": max(by_key),
+                grid["performance"] = self.performance[name].tolist()
+            criteria[strip.criterion]["grids"][name] = grid
+        over_keys = {
+            "keys": len(by_key),
+            "mean": float(by_key.mean()),
+            "std": float(by_key.std()),
+            "min": float(by_key.min()),
+            "max": float(by_key.max()),
+            "overall": self.overall_by_key,
+            "scores": self.scores_by_key,
         }
-        over_keys = {name: float(value) for name, value in summary.items()}
-        over_keys |= {"overall": self.overall_by_key, "scores": self.scores_by_key}
         return {
             "overall": self.overall,
             "scores": self.scores,
@@ -125,23 +99,42 @@ def passes(fraction: np.ndarray) -> np.ndarray:
     return np.asarray(fraction) > 0.5
 
 
-def _base(nominal: Scenario, draws: bool) -> Scenario:
-    """The nominal scenario, with all that criteria of one kind vary in it at no strength.
+def _base(nominal: Scenario, strips: Iterable[Strip]) -> Scenario:
+    """The nominal scenario, with all that the strips vary in it at no strength.
 
-    One program for all criteria that draw something and one for all others: what the absent
-    imperfections cost a run is little beside what six programs cost to compile.
+    One program for all that draws something and one for all else: what the absent imperfections
+    cost a run is little beside what six programs cost to compile.
     """
-    numbers = lambda value, *shape: np.full(shape, value, nominal.dtype)  # noqa: E731
-    neutral = {"delay": np.zeros(4, "i4"), "responsiveness": numbers(1)}
-    if draws:
-        silent = Pulses(numbers(0, 2, 3), numbers(1, 2, 3), numbers(0, 2, 3))
-        neutral = {"measurement_noise": numbers(0, 4), "torque_noise": numbers(0, 2)}
-        neutral |= {"pulses": silent}
-    absent = {name: v for name, v in neutral.items() if getattr(nominal, name) is None}
-    return nominal.replace(**absent)
+
+    def full(value: float, *shape: int) -> np.ndarray:
+        return np.full(shape, value, nominal.dtype)
+
+    neutral = {
+        "delay": np.zeros(4, "i4"),
+        "responsiveness": full(1),
+        "measurement_noise": full(0, 4),
+        "torque_noise": full(0, 2),
+        "process_noise": full(0, 4),
+        "pulses": Pulses(full(0, 2, 3), full(1, 2, 3), full(0, 2, 3)),
+    }
+    names = {strip.variation for strip in strips}
+    touched = {
+        "delay": {"delay", "velocity_delay"},
+        "measurement_noise": {"velocity_noise", "position_noise"},
+        "pulses": {"perturbation"},
+    }
+    absent = {
+        field: value
+        for field, value in neutral.items()
+        if getattr(nominal, field) is None and touched.get(field, {field}) & names
+    }
+    base = nominal.replace(**absent)
+    if base.plant.coulomb_friction is None and {"cf1", "cf2"} & names:
+        base = base.replace(plant=base.plant.replace(coulomb_friction=full(0, 2)))
+    return base
 
 
-def _scenarios(base: Scenario, grids: Iterable[Strip], key: jax.Array, dt: float) -> Scenario:
+def _scenarios(base: Scenario, strips: Iterable[Strip], key: jax.Array, dt: float) -> Scenario:
     """One batch with every run of the strips, repetitions innermost."""
     batches = [
         vary(
@@ -150,17 +143,17 @@ def _scenarios(base: Scenario, grids: Iterable[Strip], key: jax.Array, dt: float
             key=jax.random.fold_in(key, number),
             dt=dt,
         )
-        for number, s in enumerate(grids)
+        for number, s in enumerate(strips)
     ]
     return jax.tree.map(lambda *parts: np.concatenate(parts), *batches)
 
 
-def _split(grids: Iterable[Strip], values: np.ndarray) -> dict[str, np.ndarray]:
-    """Per variation, the mean over repetitions of what ``_scenarios`` lined up."""
+def _split(grids: Mapping[str, Strip], values: np.ndarray) -> dict[str, np.ndarray]:
+    """Per grid, the mean over repetitions of what ``_scenarios`` lined up."""
     found, start = {}, 0
-    for s in grids:
+    for name, s in grids.items():
         n = len(s.values) * s.repetitions
-        found[s.variation] = values[start : start + n].reshape(-1, s.repetitions).mean(axis=1)
+        found[name] = values[start : start + n].reshape(-1, s.repetitions).mean(axis=1)
         start += n
     return found
 
@@ -178,86 +171,119 @@ def _compile(jobs: list[tuple], options: dict[str, Any]) -> float:
     return time.perf_counter() - start
 
 
+def _named(grids: Iterable[Strip]) -> dict[str, Strip]:
+    """The strips by the name of what they vary; of several, the later ones with a number."""
+    named: dict[str, Strip] = {}
+    for strip in grids:
+        choose("variation", strip.variation, VARIATIONS)
+        if strip.repetitions < 1:
+            raise JaxpendError(f"repetitions is {strip.repetitions}; it must be at least 1")
+        count = sum(other.variation == strip.variation for other in named.values())
+        name = f"{strip.variation} ({count + 1})" if count else strip.variation
+        named[name] = dataclasses.replace(strip, values=np.atleast_1d(strip.values))
+    if not named:
+        raise JaxpendError("grids is empty; give at least one strip")
+    return named
+
+
 def benchmark(
     controller: Controller,
-    scenario: Scenario | Plant,
+    judged_on: Board | str | Scenario | Plant,
     key: jax.Array,
     *,
-    keys: int = 1,
+    keys: int = KEYS,
     scored: bool = False,
-    dt: float = 0.002,
-    duration: float = 10.0,
+    dt: float = DT,
+    duration: float = DURATION,
     chunk: int | None = None,
-    grids: list[Strip] | None = None,
+    grids: Sequence[Strip] | None = None,
 ) -> Report:
-    """Judge a controller. What is reported is the first key's; the others give the spread.
+    """Judge a controller.
 
     Args:
         controller: any controller; a ``PythonLaw`` for one that is not written in jax.
-        scenario: the nominal plant, such as ``designs.competition(robot)``, or a scenario with
-            more that goes wrong in every run; its type is the precision.
+        judged_on: a board, "acrobot" or "pendubot" for the v2 board of that robot; or a nominal
+            plant; or a scenario, with more that goes wrong in every run. The type of its numbers
+            is the precision.
         key: split per key, criterion, scenario and run.
-        keys: how often the criteria that draw something (noise, disturbances) are repeated.
+        keys: how often what draws something (noise, disturbances) is repeated; what is reported
+            is the median.
         scored: the mean v2 performance score at every grid value too.
         dt, duration: s; the perturbations need 10 s.
         chunk: of ``sweep``.
-        grids: other strips than the official ones.
+        grids: other strips than the official ones, of any criteria and variations.
 
     Raises:
-        JaxpendError: fewer than one key, or as ``sweep``.
+        JaxpendError: fewer than one key, no strips, a controller of the other robot, or as
+            ``sweep``.
     """
     if keys < 1:
         raise JaxpendError(f"keys is {keys}; it must be at least 1")
-    nominal = Scenario(scenario) if isinstance(scenario, Plant) else scenario
-    grids = strips(nominal.plant) if grids is None else grids
+    trials = strips
+    if isinstance(judged_on, Board | str):
+        official = board(judged_on)
+        check_robot(controller, official.robot)
+        judged_on, trials = official.task.plant, official.trials
+    nominal = Scenario(judged_on) if isinstance(judged_on, Plant) else judged_on
+    named = _named(trials(nominal.plant) if grids is None else grids)
     options = {"scored": scored, "dt": dt, "duration": duration, "chunk": chunk}
+    rows = {
+        draws: {n: s for n, s in named.items() if VARIATIONS[s.variation].draws == draws}
+        for draws in (False, True)
+    }
     jobs = {}
-    for draws in (False, True):
-        rows = [s for s in grids if (s.criterion in RANDOM) == draws]
-        for number in range(keys if draws else 1) if rows else ():
+    for draws, its in rows.items():
+        for number in range(keys if draws else 1) if its else ():
             draw_key, run_key = jax.random.split(jax.random.fold_in(key, number))
-            scenarios = _scenarios(_base(nominal, draws), rows, draw_key, dt)
+            scenarios = _scenarios(_base(nominal, its.values()), its.values(), draw_key, dt)
             jobs[draws, number] = (scenarios, controller, run_key)
     compile_seconds = _compile([job for (_, number), job in jobs.items() if number == 0], options)
     start = time.perf_counter()
     outcomes = {name: sweep(*job, **options) for name, job in jobs.items()}
-    return _report(grids, outcomes, keys, compile_seconds, time.perf_counter() - start)
+    seconds = {"compile_seconds": compile_seconds, "run_seconds": time.perf_counter() - start}
+    return _report(named, rows, outcomes, keys, **seconds)
 
 
-def _report(grids, outcomes, keys, compile_seconds, run_seconds) -> Report:
+def _report(named, rows, outcomes, keys, **seconds) -> Report:
     """Put together the outcomes, which go by (draws something, number of the key)."""
-    rows = {kind: [s for s in grids if (s.criterion in RANDOM) == kind] for kind, _ in outcomes}
 
     def of_key(number: int, field: str) -> dict[str, np.ndarray]:
         found = {}
-        for draws in rows:
-            outcome = outcomes[draws, number if draws else 0]
-            found |= _split(rows[draws], getattr(outcome, field))
+        for draws, its in rows.items():
+            if its:
+                outcome = outcomes[draws, number if draws else 0]
+                found |= _split(its, getattr(outcome, field))
         return found
 
+    criteria: dict[str, list[str]] = {}
+    for name, strip in named.items():
+        criteria.setdefault(strip.criterion, []).append(name)
+
     def scores(success: dict[str, np.ndarray]) -> dict[str, float]:
-        of = {c: [success[s.variation] for s in grids if s.criterion == c] for c in CRITERIA}
-        return {c: float(np.mean(passes(np.concatenate(f)))) for c, f in of.items() if f}
+        return {
+            criterion: float(np.mean(passes(np.concatenate([success[n] for n in names]))))
+            for criterion, names in criteria.items()
+        }
 
     success = [of_key(number, "success") for number in range(keys)]
     by_key = [scores(s) for s in success]
-    diverged = dict.fromkeys(by_key[0], 0)
-    for s in grids:
-        diverged[s.criterion] += round(of_key(0, "diverged")[s.variation].sum() * s.repetitions)
+    drawn = {named[name].criterion for name in rows[True]}
+    lost, diverged = of_key(0, "diverged"), dict.fromkeys(criteria, 0)
+    for name, strip in named.items():
+        diverged[strip.criterion] += round(lost[name].sum() * strip.repetitions)
     scored = next(iter(outcomes.values())).score is not None
     overall = [float(np.mean(list(s.values()))) for s in by_key]
     return Report(
-        overall=overall[0],
-        scores=by_key[0],
-        grids=grids,
+        overall=statistics.median(overall),
+        scores={c: statistics.median([s[c] for s in by_key]) for c in criteria},
+        grids=named,
         success=success[0],
         performance=of_key(0, "score") if scored else None,
         diverged=diverged,
         overall_by_key=overall,
-        scores_by_key={c: [s[c] for s in by_key] for c in by_key[0] if c in RANDOM},
-        simulations=sum(len(s.values) * s.repetitions for s in grids),
-        compile_seconds=compile_seconds,
-        run_seconds=run_seconds,
+        scores_by_key={c: [s[c] for s in by_key] for c in criteria if c in drawn},
+        simulations=sum(len(s.values) * s.repetitions for s in named.values()),
+        **seconds,
     )
 
 
@@ -266,10 +292,10 @@ def _report(grids, outcomes, keys, compile_seconds, run_seconds) -> Report:
 
 def nominal_and_worst(plant: Plant) -> dict[str, tuple[float, float]]:
     """For ``--worst``: from nothing wrong to the worst end of the official grids."""
-    grids = {s.variation: s.values for s in strips(plant)}
-    rising = {name: (0.0, grids[name][-1]) for name in ("b1", "b2", "cf1", "cf2", "Ir", "delay")}
-    rising |= {name: (0.0, grids[name][-1]) for name in ("velocity_noise", "torque_noise")}
-    return rising | {"m2": (grids["m2"][10], grids["m2"][-1]), "responsiveness": (1.0, 0.1)}
+    names = ("b1", "b2", "cf1", "cf2", "Ir", "delay", "velocity_noise", "torque_noise")
+    m2 = float(plant.mass[1])
+    rising = {name: (0.0, RANGES[name][1]) for name in names}
+    return rising | {"m2": (m2, INERTIAL[1] * m2), "responsiveness": (1.0, 0.1)}
 
 
 def success_map(controller, plant, names, key, options) -> dict[str, Any]:

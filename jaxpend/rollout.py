@@ -1,19 +1,30 @@
 """The closed loop: one ``lax.scan`` of a controller on a scenario. Nothing else simulates."""
 
+import sys
+import types
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .controller import Controller
+from .controller import Controller, check_form
 from .errors import JaxpendError
 from .plant import Plant, rk4_step
 from .pytree import pytree
-from .scenario import Scenario
+from .scenario import DT, DURATION, Scenario
 
-__all__ = ["Trajectory", "final_state", "rollout", "time_stamps"]
+__all__ = [
+    "Trajectory",
+    "actuate",
+    "draws",
+    "final_state",
+    "measure",
+    "rollout",
+    "time_stamps",
+]
 
 # Columns of the standard normals of one step, in the order of the reference simulator.
 NOISE = {
@@ -106,6 +117,9 @@ def _closed_loop(scenario, controller, key, dt, duration, integrator, delay_slot
         history, measured = measure(scenario, history, now["k"], x, now["z"])
         memory, command = controller(memory, now["t"], measured)
         command = jnp.asarray(command, dtype)
+        if command.shape != (2,):
+            name = type(controller).__name__
+            raise JaxpendError(f"{name} returns a torque of shape {command.shape}; it must be (2,)")
         u = actuate(scenario, command, u, now["t_pulse"], now["z"])
         x_next = integrator(plant, x, u, dt)
         if scenario.process_noise is not None:
@@ -122,7 +136,8 @@ def _closed_loop(scenario, controller, key, dt, duration, integrator, delay_slot
     return Trajectory(jnp.asarray(stamps.astype(dtype)), x, u, measured, command)
 
 
-def _check(scenario: Scenario | Plant, delay_slots: int) -> Scenario:
+def _check(scenario: Scenario | Plant, controller: Controller, delay_slots: int) -> Scenario:
+    check_form(controller)
     scenario = Scenario(scenario) if isinstance(scenario, Plant) else scenario
     if scenario.x0 is not None and jnp.shape(scenario.x0) != (4,):
         raise JaxpendError(
@@ -145,8 +160,8 @@ def rollout(
     controller: Controller,
     key: jax.Array,
     *,
-    dt: float = 0.002,
-    duration: float = 10.0,
+    dt: float = DT,
+    duration: float = DURATION,
     integrator: Callable = rk4_step,
     delay_slots: int = 32,
     normals: jax.Array | None = None,
@@ -168,9 +183,10 @@ def rollout(
             2 torque, 4 process.
 
     Raises:
-        JaxpendError: dt or duration not positive, or a delay longer than the buffer.
+        JaxpendError: dt or duration not positive, a delay longer than the buffer, what is no
+            controller, or a torque of another shape.
     """
-    scenario = _check(scenario, delay_slots)
+    scenario = _check(scenario, controller, delay_slots)
     return _closed_loop(
         scenario, controller, key, dt, duration, integrator, delay_slots, normals, record=True
     )
@@ -188,11 +204,21 @@ def final_state(
     controller: Controller,
     key: jax.Array,
     *,
-    dt: float = 0.002,
-    duration: float = 10.0,
+    dt: float = DT,
+    duration: float = DURATION,
     integrator: Callable = rk4_step,
     delay_slots: int = 32,
 ) -> jax.Array:
     """Only the last true state of ``rollout``, shape (4,): no trajectory is kept in memory."""
-    scenario = _check(scenario, delay_slots)
+    scenario = _check(scenario, controller, delay_slots)
     return _final_state(scenario, controller, key, dt, duration, integrator, delay_slots)
+
+
+class _Rollout(types.ModuleType):
+    """This module can be called: ``jaxpend.rollout`` is the function and the module at once."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Trajectory:
+        return rollout(*args, **kwargs)
+
+
+sys.modules[__name__].__class__ = _Rollout

@@ -12,7 +12,11 @@ from .errors import JaxpendError, choose
 from .plant import Plant
 from .pytree import pytree
 
-__all__ = ["Pulses", "Scenario", "check_values", "delay_steps", "random_pulses"]
+__all__ = ["DT", "DURATION", "Pulses", "Scenario", "check_values", "delay_steps", "random_pulses"]
+
+# Of the boards, and of everything here that does not say otherwise, s.
+DT = 0.002  # control and integration period
+DURATION = 10.0
 
 
 @pytree
@@ -49,7 +53,7 @@ class Scenario:
         return jnp.result_type(*(t for t in types if jnp.issubdtype(t, jnp.floating)))
 
 
-def delay_steps(delay: float, dt: float = 0.002, mode: str = "posvel") -> np.ndarray:
+def delay_steps(delay: float, dt: float = DT, mode: str = "posvel") -> np.ndarray:
     """Whole steps by which each measured component lags, shape (4,), int.
 
     Args:
@@ -68,7 +72,7 @@ def delay_steps(delay: float, dt: float = 0.002, mode: str = "posvel") -> np.nda
 def random_pulses(
     key: jax.Array,
     *,
-    duration: float = 10.0,
+    duration: float = DURATION,
     per_joint: int = 3,
     distance: float = 1.0,
     width: tuple[float, float] = (0.05, 0.1),

@@ -1,23 +1,33 @@
-"""The criteria and scores of the RealAIGym leaderboards, as pure functions of a trajectory.
+"""Judging: the criteria and the score of a controller's run of a task, and the official one.
 
-The definitions are those of the RealAIGym ``double_pendulum`` benchmark (Wiebe et al.,
-"Reinforcement learning for athletic intelligence", IJCAI 2024 competition track). Everything
-accepts leading batch axes and can be jitted, vmapped and (where smooth) differentiated.
+The definitions are in ``jaxpend.criteria``, whose names can be imported from here.
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from .controller import Controller
-from .designs import competition
-from .errors import JaxpendError
+from .boards import Board, Task, board
+from .controller import Controller, check_controller, check_form, check_robot
+from .criteria import (
+    V1_DEFAULT,
+    V1_OFFICIAL,
+    V2_HARDWARE,
+    V2_OFFICIAL,
+    Criteria,
+    ScoreV2,
+    ScoreV3,
+    criteria,
+    score_v1,
+    score_v2,
+    score_v3,
+)
 from .plant import Plant
-from .pytree import pytree
 from .rollout import Trajectory, rollout
 from .scenario import Scenario
-from .variations import LONGEST_DELAY, sample
+from .variations import LONGEST_DELAY
 
 __all__ = [
     "V1_DEFAULT",
@@ -25,6 +35,8 @@ __all__ = [
     "V2_HARDWARE",
     "V2_OFFICIAL",
     "Criteria",
+    "ScoreV2",
+    "ScoreV3",
     "criteria",
     "imperfect",
     "nominal",
@@ -36,185 +48,72 @@ __all__ = [
     "score_v3",
 ]
 
-# criterion -> (weight, normalisation); the sums of the leaderboard's own configurations.
-V1_OFFICIAL = {
-    "swingup_time": (0.2, 10.0), "max_tau": (0.1, 6.0), "energy": (0.1, 100.0),
-    "integ_tau": (0.1, 60.0), "tau_cost": (0.1, 360.0), "tau_smoothness": (0.2, 12.0),
-    "velocity_cost": (0.2, 1000.0),
-}  # fmt: skip
-V1_DEFAULT = {
-    "swingup_time": (0.2, 10.0), "max_tau": (0.1, 1.0), "integ_tau": (0.1, 10.0),
-    "tau_smoothness": (0.6, 1.0), "velocity_cost": (0.2, 1000.0),
-}  # fmt: skip
-# criterion -> normalisation; the terms of v2 have equal weight.
-V2_OFFICIAL = {
-    "swingup_time": 20.0, "energy": 60.0, "tau_cost": 20.0, "tau_smoothness": 0.1,
-    "velocity_cost": 400.0,
-}  # fmt: skip
-V2_HARDWARE = V2_OFFICIAL | {"tau_cost": 100.0, "tau_smoothness": 4.0}
-
-
-@pytree
-class Criteria:
-    """What the leaderboards measure; every field has the batch shape of the trajectories."""
-
-    swingup_time: jax.Array  # s, start of the time above the line that lasts to the end
-    max_tau: jax.Array  # N m
-    energy: jax.Array  # J, sum of |torque x angle change|
-    integ_tau: jax.Array  # N m s
-    tau_cost: jax.Array  # N^2 m^2 s
-    tau_smoothness: jax.Array  # N m, standard deviation of the torque changes
-    velocity_cost: jax.Array  # rad^2/s
-    uptime: jax.Array  # s above the line
-    number_of_swingups: jax.Array  # rises above the line more than 1 s apart
-    success: jax.Array  # bool, above the line at the end
-
-
-def _swingup_index(up: jax.Array) -> jax.Array:
-    """Index of the swing-up: the reference looks at samples 1 to N - 2 only, from the end."""
-    inner = up[..., 1:-1]
-    position = jnp.arange(1, up.shape[-1] - 1)
-    return 1 + jnp.max(jnp.where(inner, 0, position), axis=-1, initial=0)
-
-
-def _count_swingups(t: jax.Array, up: jax.Array, deadtime: float = 1.0) -> jax.Array:
-    """Rises above the line more than ``deadtime`` s after the one counted before."""
-    t, up = jnp.moveaxis(jnp.broadcast_to(t, up.shape), -1, 0), jnp.moveaxis(up, -1, 0)
-
-    def step(carry, now):
-        count, t_counted, was_up = carry
-        t, is_up = now
-        counts = is_up & ~was_up & (t - t_counted > deadtime)
-        return (count + counts, jnp.where(counts, t, t_counted), is_up), None
-
-    zeros = jnp.zeros(up.shape[1:])
-    start = (zeros.astype(int), zeros.astype(t.dtype) - deadtime, zeros.astype(bool))
-    return jax.lax.scan(step, start, (t, up))[0][0]
-
-
-def criteria(
-    t: jax.Array,
-    x: jax.Array,
-    u: jax.Array,
-    plant: Plant,
-    *,
-    height: float = 0.9,
-    t_final: float = 10.0,
-) -> Criteria:
-    """The leaderboard's criteria of one trajectory or a batch of them.
-
-    Args:
-        t: (..., N) or (..., N + 1) time stamps, s.
-        x: (..., N, 4) or (..., N + 1, 4) states. The official path stores as many states as
-            torques, so a last state beyond them is dropped here too.
-        u: (..., N, 2) applied torques, N m.
-        plant: gives the link lengths; one for the whole batch.
-        height: the line, as a fraction of the stretched height above joint 1.
-        t_final: s; a trajectory that ends before 0.99 of it has an infinite swing-up time.
-
-    Raises:
-        JaxpendError: shapes that do not fit together or fewer than three samples.
-    """
-    n = u.shape[-2] if u.ndim > 1 else 0
-    fits = t.shape[-1] == x.shape[-2] and t.shape[-1] in (n, n + 1)
-    if n < 3 or not fits or x.shape[-1] != 4 or u.shape[-1] != 2:
-        raise JaxpendError(
-            f"criteria need t (..., N or N+1), x (..., N or N+1, 4), u (..., N, 2) with N > 2; "
-            f"got t {t.shape}, x {x.shape}, u {u.shape}"
-        )
-    t, x = t[..., :n], x[..., :n, :]
-    l1, l2 = plant.length[0], plant.length[1]
-    y = -l1 * jnp.cos(x[..., 0]) - l2 * jnp.cos(x[..., 0] + x[..., 1])
-    up = y > height * (l1 + l2)
-    dt, held, moves = jnp.diff(t), u[..., :-1, :], jnp.diff(x[..., :2], axis=-2)
-    stamps = jnp.broadcast_to(t, up.shape)
-    index = _swingup_index(up)
-    swingup_time = jnp.take_along_axis(stamps, index[..., None], axis=-1)[..., 0]
-    swingup_time = jnp.where(stamps[..., -1] < 0.99 * t_final, jnp.inf, swingup_time)
-    velocity = x[..., :-1, 2:]
-    since_last = jnp.diff(t, prepend=jnp.zeros_like(t[..., :1]))
-    return Criteria(
-        swingup_time=swingup_time,
-        max_tau=jnp.max(jnp.abs(u), axis=(-2, -1)),
-        energy=jnp.sum(jnp.abs(moves * held), axis=(-2, -1)),
-        integ_tau=jnp.sum(jnp.abs(held) * dt[..., None], axis=(-2, -1)),
-        tau_cost=jnp.sum(held**2 * dt[..., None], axis=(-2, -1)),
-        tau_smoothness=jnp.sum(jnp.std(jnp.diff(u, axis=-2), axis=-2), axis=-1),
-        velocity_cost=jnp.sum(velocity**2 * dt[..., None], axis=(-2, -1)),
-        uptime=jnp.sum(jnp.where(up, since_last, 0.0), axis=-1),
-        number_of_swingups=_count_swingups(t, up),
-        success=swingup_time < stamps[..., -1],
-    )
-
 
 def performance(
-    controller: Controller, scenario: Scenario | Plant, key: jax.Array, **options
+    controller: Controller,
+    scenario: Scenario | Plant,
+    key: jax.Array,
+    task: Task,
+    **options: Any,
 ) -> Criteria:
-    """Criteria of an official run: 10 s at 500 Hz, on a plant or on a scenario around one.
+    """Criteria of a run on the time grid of a task, on a plant or on a scenario around one.
 
-    ``options`` are those of ``rollout``.
+    ``key`` is that of ``rollout``, ``options`` are its other ones.
     """
-    run = rollout(scenario, controller, key, **options)
-    plant = scenario.plant if isinstance(scenario, Scenario) else scenario
-    return criteria(run.t, run.x, run.u, plant)
+    run = rollout(scenario, controller, key, dt=task.dt, duration=task.duration, **options)
+    return task.criteria(run, scenario.plant if isinstance(scenario, Scenario) else scenario)
 
 
-def imperfect(controller: Controller, plant: Plant, key: jax.Array, count: int) -> Criteria:
-    """Criteria (count,) of official runs on random imperfect scenarios (``randomisation.sample``).
-
-    ``plant`` is the nominal one; ``key`` is consumed.
-    """
+def imperfect(controller: Controller, task: Task, key: jax.Array, count: int) -> Criteria:
+    """Criteria (count,) of runs in random imperfect scenarios of a task; ``key`` is consumed."""
     key_scenarios, key_runs = jax.random.split(key)
-    scenarios = jax.vmap(lambda k: sample(plant, k))(jax.random.split(key_scenarios, count))
-    one = lambda s, k: performance(controller, s, k, delay_slots=LONGEST_DELAY + 1)  # noqa: E731
+    scenarios = jax.vmap(task.sample)(jax.random.split(key_scenarios, count))
+
+    def one(scenario: Scenario, key: jax.Array) -> Criteria:
+        return performance(controller, scenario, key, task, delay_slots=LONGEST_DELAY + 1)
+
     return jax.vmap(one)(scenarios, jax.random.split(key_runs, count))
 
 
-def score_v1(c: Criteria, terms: dict[str, tuple[float, float]] = V1_OFFICIAL) -> jax.Array:
-    """``success (1 - sum_i w_i c_i / n_i)``; NaN, as there, where the trajectory was too short."""
-    cost = sum(weight * getattr(c, name) / norm for name, (weight, norm) in terms.items())
-    failed = jnp.where(jnp.isinf(c.swingup_time), jnp.nan, 0.0)
-    return jnp.where(c.success, 1.0 - cost, failed)
+@partial(jax.jit, static_argnames="task")
+def nominal(controller: Controller, task: Task) -> Criteria:
+    """``performance`` on the nominal plant, compiled once a kind of controller."""
+    return performance(controller, task.plant, jax.random.key(0), task)
 
 
-def score_v2(c: Criteria, norms: dict[str, float] = V2_OFFICIAL) -> jax.Array:
-    """``success (1 - mean_i tanh(pi c_i / n_i))``, in [0, 1); 0 for a failed or diverged run."""
-    penalties = [jnp.tanh(jnp.pi * getattr(c, name) / norm) for name, norm in norms.items()]
-    return jnp.where(c.success, 1.0 - sum(penalties) / len(penalties), 0.0)
-
-
-def score_v3(c: Criteria, t_final: float = 60.0) -> jax.Array:
-    """``uptime / t_final``; the leaderboard's runs last 60 s."""
-    return c.uptime / t_final
-
-
-@partial(jax.jit, static_argnames="robot")
-def nominal(controller: Controller, robot: str) -> Criteria:
-    """``performance`` on the plant of the v2 boards, compiled once a kind of controller."""
-    return performance(controller, competition(robot), jax.random.key(0))
-
-
-@partial(jax.jit, static_argnames="robot")
-def nominal_run(controller: Controller, robot: str) -> tuple[Trajectory, Criteria]:
+@partial(jax.jit, static_argnames="task")
+def nominal_run(controller: Controller, task: Task) -> tuple[Trajectory, Criteria]:
     """What ``nominal`` judges, and its criteria."""
-    plant = competition(robot)
-    run = rollout(plant, controller, jax.random.key(0))
-    return run, criteria(run.t, run.x, run.u, plant)
+    key = jax.random.key(0)
+    run = rollout(task.plant, controller, key, dt=task.dt, duration=task.duration)
+    return run, task.criteria(run)
 
 
-def _in_float64(leaf):
+def _in_float64(leaf: Any) -> Any:
     return jnp.asarray(leaf, "f8") if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) else leaf
 
 
-def official(controller: Controller, robot: str) -> dict:
-    """Score, success and criteria of a controller as plain numbers, computed in float64."""
+def official(controller: Controller, judged_on: Board | str) -> dict[str, Any]:
+    """Score, success and criteria of a controller as plain numbers, computed in float64.
+
+    Args:
+        controller: any controller.
+        judged_on: a board, or "acrobot" or "pendubot" for the v2 board of that robot.
+
+    Raises:
+        JaxpendError: it is no controller, or one of the other robot.
+    """
+    task = board(judged_on).task
+    check_form(controller)
+    check_robot(controller, task.robot)
     with jax.enable_x64(True):
         controller = jax.tree.map(_in_float64, controller)
-        c = nominal(controller, robot)
+        check_controller(controller)
+        c = nominal(controller, task)
         names = [name for name in vars(c) if name != "success"]
         return {
-            "robot": robot,
-            "score": float(score_v2(c)),
+            "robot": task.robot,
+            "score": float(task.score(c)),
             "success": bool(c.success),
             "criteria": {name: float(getattr(c, name)) for name in names},
         }

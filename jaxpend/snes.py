@@ -1,12 +1,12 @@
 """Separable natural evolution strategy on a controller's parameters against the official score.
 
 SNES (Wierstra et al., "Natural evolution strategies", JMLR 2014; evosax) starts from a trained
-policy, or from any other controller that declares what may be searched (``parameters.py``). The
-fitness of an individual is its official v2 score (10 s at 500 Hz), averaged over rollouts in
-which a policy's greedy action is un-squashed, disturbed by Gaussian noise and squashed again
-(Calì et al., 2024), so that what is found stands on wide ground. All individuals of a
-generation meet the same noise: common random numbers make the comparison fair. Other strategies of
-evosax stand behind the same options.
+policy, or from any other controller that declares what may be searched
+(``controllers/search_space.py``). The fitness of an individual is its score in the task (10 s at
+500 Hz on the v2 boards), averaged over rollouts in which a policy's greedy action is un-squashed,
+disturbed by Gaussian noise and squashed again (Calì et al., 2024), so that what is found stands
+on wide ground. All individuals of a generation meet the same noise: common random numbers make
+the comparison fair. Other strategies of evosax stand behind the same options.
 """
 
 from functools import partial
@@ -17,16 +17,24 @@ import jax.numpy as jnp
 import optax
 from evosax import algorithms
 
-from . import config, designs
+from . import config
+from .boards import Task
 from .config import SNESConfig
-from .controller import Controller
+from .controller import Controller, check_controller
 from .controllers.policy import change_policies
 from .controllers.search_space import coordinates
-from .errors import JaxpendError
 from .pytree import pytree
-from .score import imperfect, performance, score_v2
+from .score import imperfect, performance
 
-__all__ = ["SNESConfig", "SNESState", "evolve", "fitness", "init"]
+__all__ = [
+    "SNESConfig",
+    "SNESState",
+    "best_controller",
+    "evolve",
+    "fitness",
+    "init",
+    "mean_controller",
+]
 
 STRATEGIES = {name: getattr(algorithms, kind) for name, kind in config.STRATEGIES.items()}
 
@@ -43,31 +51,27 @@ class SNESState:
 
 
 def fitness(
-    config: SNESConfig, controller: Controller, key: jax.Array, robot: str | None = None
+    config: SNESConfig, controller: Controller, key: jax.Array, task: Task
 ) -> tuple[jax.Array, jax.Array]:
     """Fitness of a controller, to be maximised, and how many of its rollouts diverged.
 
-    The mean v2 score over noisy nominal rollouts; with ``config.scenarios``, its weighted mean
-    with the mean v2 score over random imperfect scenarios (``randomisation.sample``). ``robot``
-    may be left out for a policy, which knows it; else a ``JaxpendError`` asks for it.
+    The mean score of the task over noisy nominal rollouts; with ``config.scenarios``, its
+    weighted mean with the mean score over random imperfect scenarios of the task.
     """
-    robot = robot or getattr(controller, "robot", None)
-    if robot is None:
-        raise JaxpendError(f"{type(controller).__name__} does not know its robot; name it")
-    plant = designs.competition(robot)
+    plant = task.plant
     key_noise, key_scenarios = jax.random.split(key)
     noise = jnp.asarray(config.action_noise, jnp.float32) if config.action_noise else None
     noisy, policies = change_policies(controller, lambda p: p.replace(action_noise=noise))
     draws = policies and config.action_noise
     keys = jax.random.split(key_noise, config.rollouts if draws else 1)
-    c = jax.vmap(lambda k: performance(noisy, plant, k))(keys)
+    c = jax.vmap(lambda k: performance(noisy, plant, k, task))(keys)
     # A diverged rollout has score 0 already; its velocity says that it diverged.
-    score, diverged = score_v2(c).mean(), jnp.sum(~jnp.isfinite(c.velocity_cost))
+    score, diverged = task.score(c).mean(), jnp.sum(~jnp.isfinite(c.velocity_cost))
     if not config.scenarios:
         return score, diverged
-    c = imperfect(controller, plant, key_scenarios, config.scenarios)
+    c = imperfect(controller, task, key_scenarios, config.scenarios)
     weight = config.scenario_weight
-    score = (1 - weight) * score + weight * score_v2(c).mean()
+    score = (1 - weight) * score + weight * task.score(c).mean()
     return score, diverged + jnp.sum(~jnp.isfinite(c.velocity_cost))
 
 
@@ -81,7 +85,10 @@ class _Search:
     def __init__(self, config: SNESConfig, controller: Controller):
         flat, weights, self._rebuild = coordinates(controller, config.searched)
         std = jnp.where(weights, config.sigma, config.gain_sigma).astype(flat.dtype)
-        shrunk = lambda generation: config.final_sigma ** (generation / config.generations)  # noqa: E731
+
+        def shrunk(generation):
+            return config.final_sigma ** (generation / config.generations)
+
         # Its mean moves by a tenth of sigma a generation; its sigma follows a schedule only.
         options = {"optimizer": optax.adam(0.1), "std_schedule": shrunk}
         options = options if config.strategy == "open_es" else {}
@@ -103,7 +110,11 @@ class _Search:
 
 
 def init(config: SNESConfig, controller: Controller, key: jax.Array) -> SNESState:
-    """Search distribution centred on the controller. Raises as ``parameters.kinds``."""
+    """Search distribution centred on the controller; ``key`` is consumed.
+
+    Raises ``JaxpendError`` as ``check_controller`` and ``search_space.kinds``.
+    """
+    check_controller(controller)
     search = _Search(config, controller)
     key, key_init = jax.random.split(key)
     state = search.strategy.init(key_init, search.start, search.params)
@@ -112,18 +123,17 @@ def init(config: SNESConfig, controller: Controller, key: jax.Array) -> SNESStat
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf)), state)
 
 
-@partial(jax.jit, static_argnames=("config", "generations", "robot"))
+@partial(jax.jit, static_argnames=("config", "generations", "task"))
 def evolve(
     config: SNESConfig,
     start: Controller,
     state: SNESState,
     generations: int,
-    robot: str | None = None,
-):
+    task: Task,
+) -> tuple[SNESState, dict[str, jax.Array]]:
     """Run some generations; returns the state and per-generation metrics (generations,).
 
     ``start`` is what ``init`` got: the origin of the coordinates, and all that is not searched.
-    ``robot`` is as in ``fitness``.
     """
     search = _Search(config, start)
     strategy, params = search.strategy, search.params
@@ -131,8 +141,9 @@ def evolve(
     def generation(state, _):
         key, key_ask, key_noise, key_tell = jax.random.split(state.key, 4)
         population, inner = strategy.ask(key_ask, state.strategy, params)
-        judge = lambda p: fitness(config, search.rebuild(p), key_noise, robot)  # noqa: E731
-        scores, diverged = jax.vmap(judge)(population)
+        scores, diverged = jax.vmap(lambda p: fitness(config, search.rebuild(p), key_noise, task))(
+            population
+        )
         if config.strategy == "lm_ma_es":  # evosax weighs what it remembers by place, not by rank
             order = jnp.argsort(-scores)
             population, scores = population[order], scores[order]

@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .controller import Controller
-from .errors import JaxpendError
+from .controller import Controller, check_controller
+from .criteria import EPSILON, criteria, score_v2, upright
+from .errors import JaxpendError, choose
 from .plant import Plant
 from .pytree import pytree
 from .rollout import final_state, rollout
-from .scenario import Scenario, check_values
-from .score import criteria, score_v2
-from .variations import vary
+from .scenario import DT, DURATION, Scenario, check_values
+from .variations import VARIATIONS, vary
 
 __all__ = [
     "EPSILON",
@@ -33,9 +33,6 @@ __all__ = [
     "upright",
 ]
 
-# Success: the final state within these of upright (rad, rad, rad/s, rad/s), strictly.
-EPSILON = (0.35, 0.35, 1.0, 1.0)
-
 
 @pytree
 class Outcome:
@@ -45,17 +42,6 @@ class Outcome:
     success: jax.Array  # (n,) bool, upright at the end
     diverged: jax.Array  # (n,) bool, not a number: a failure
     score: jax.Array | None = None  # (n,) v2 score, 0 for a failure of its own rule
-
-
-def upright(x: jax.Array) -> jax.Array:
-    """Whether states (..., 4) are within ``EPSILON`` of upright; False for what is not a number.
-
-    theta1 is taken modulo 2 pi and theta2 wrapped to [-pi, pi), as the benchmark does.
-    """
-    theta1 = jnp.mod(x[..., 0], 2 * jnp.pi) - jnp.pi
-    theta2 = jnp.mod(x[..., 1] + jnp.pi, 2 * jnp.pi) - jnp.pi
-    off = jnp.stack([theta1, theta2, x[..., 2], x[..., 3]], axis=-1)
-    return jnp.all(jnp.abs(off) < jnp.asarray(EPSILON, x.dtype), axis=-1)
 
 
 @partial(jax.jit, static_argnames=("scored", "dt", "duration", "delay_slots"))
@@ -116,8 +102,8 @@ def sweep(
     key: jax.Array,
     *,
     scored: bool = False,
-    dt: float = 0.002,
-    duration: float = 10.0,
+    dt: float = DT,
+    duration: float = DURATION,
     chunk: int | None = None,
 ) -> Outcome:
     """Run one controller on a batch of scenarios.
@@ -136,9 +122,11 @@ def sweep(
         The outcome with numpy arrays, n long.
 
     Raises:
-        JaxpendError: values that mean nothing (see ``check_values``), or a chunk below 1.
+        JaxpendError: values that mean nothing (see ``check_values``), what is no controller, or
+            a chunk below 1.
     """
     check_values(scenarios)
+    check_controller(controller)
     pieces, static = _plan(scenarios, key, scored, dt, duration, chunk)
     outcomes = [_run(piece, controller, keys, **static) for piece, keys in pieces]
     n = len(scenarios.plant.mass)
@@ -157,7 +145,7 @@ def compile_sweep(
 def _varied(scenario, controller, changes, draw_key, run_key, options) -> Outcome:
     """A sweep over a scenario, or a plant, with changes to it."""
     scenario = Scenario(scenario) if isinstance(scenario, Plant) else scenario
-    scenarios = vary(scenario, changes, key=draw_key, dt=options.get("dt", 0.002))
+    scenarios = vary(scenario, changes, key=draw_key, dt=options.get("dt", DT))
     return sweep(scenarios, controller, run_key, **options)
 
 
@@ -195,18 +183,23 @@ def survey(
     """
     if repetitions < 1:
         raise JaxpendError(f"repetitions is {repetitions}; it must be at least 1")
-    values = {name: np.atleast_1d(np.asarray(v, float)) for name, v in grid.items()}
+    if not grid:
+        raise JaxpendError("the grid is empty; give at least one imperfection and its values")
+    values = {
+        name: VARIATIONS[choose("variation", name, VARIATIONS)].numbers(name, given)
+        for name, given in grid.items()
+    }
     points = np.meshgrid(*values.values(), np.arange(repetitions), indexing="ij")[:-1]
     changes = {name: p.ravel() for name, p in zip(values, points, strict=True)}
     draw_key, run_key = jax.random.split(key)
     outcome = _varied(scenario, controller, changes, draw_key, run_key, options)
     shape = points[0].shape
-    over = lambda a, rule: None if a is None else rule(a.reshape(shape), axis=-1)  # noqa: E731
+    score = outcome.score
     return Survey(
         values=values,
-        success=over(outcome.success, np.mean),
-        diverged=over(outcome.diverged, np.sum),
-        score=over(outcome.score, np.mean),
+        success=outcome.success.reshape(shape).mean(axis=-1),
+        diverged=outcome.diverged.reshape(shape).sum(axis=-1),
+        score=None if score is None else score.reshape(shape).mean(axis=-1),
     )
 
 
@@ -241,6 +234,8 @@ def mildest_failure(
     """
     if samples < 1:
         raise JaxpendError(f"samples is {samples}; it must be at least 1")
+    if not ranges:
+        raise JaxpendError("there are no ranges; give at least one imperfection and its ends")
     place_key, draw_key, run_key = jax.random.split(key, 3)
     fraction = np.asarray(jax.random.uniform(place_key, (samples, len(ranges))), float)
     # Uniform in severity: else almost all samples of many imperfections would be bad in one.

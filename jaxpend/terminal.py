@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from .boards import HEADINGS, PUBLISHED
+from .boards import HEADINGS, v2
 
 __all__ = ["LiveProgress", "console", "robustness_table", "score_table"]
 
@@ -28,7 +28,7 @@ def score_table(results: Mapping[str, Mapping], robot: str) -> None:
         cells = (format(r["criteria"][key], form) for r in results.values())
         table.add_row(f"{heading} \\[{unit}]", *cells)
     console.print(table)
-    published = ", ".join(f"{name} {score:.3f}" for name, (score, _) in PUBLISHED[robot].items())
+    published = ", ".join(f"{name} {score:.3f}" for name, score, _ in v2(robot).published)
     console.print(f"published: {published}", style="dim")
 
 

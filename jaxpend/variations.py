@@ -3,6 +3,10 @@
 ``vary(scenario, {"m2": masses, "delay": delays}, key=key)`` is a batch of scenarios, one for
 each pair of values. Everything the robustness benchmark, severity curves and maps need is a
 call of it with the right values.
+
+``sample(plant, key)`` is a scenario with one random imperfection, spread as in the benchmark: the
+distributions are the benchmark's, not its grid points. It is traced, so a batch of them is
+``jax.vmap(sample)``, and training can draw new ones inside a jitted function.
 """
 
 import dataclasses
@@ -15,9 +19,9 @@ import numpy as np
 
 from .errors import JaxpendError, choose
 from .plant import Plant
-from .scenario import Pulses, Scenario, delay_steps, random_pulses
+from .scenario import DT, Pulses, Scenario, delay_steps, random_pulses
 
-__all__ = ["LONGEST_DELAY", "VARIATIONS", "Variation", "sample", "vary"]
+__all__ = ["INERTIAL", "LONGEST_DELAY", "RANGES", "VARIATIONS", "Variation", "sample", "vary"]
 
 # (batch of n scenarios in numpy arrays, n values, n keys) -> batch of scenarios
 Apply = Callable[[Scenario, np.ndarray, jax.Array], Scenario]
@@ -32,13 +36,25 @@ class Variation:
     unit: str
     least: float = -np.inf  # values below make no sense
     in_steps: bool = False  # seconds that the reference cuts off to whole steps
+    draws: bool = False  # whether a run of it depends on a key
 
-    def checked(self, name: str, values: Any, dt: float) -> np.ndarray:
-        """The values (n,) as ``apply`` takes them. Raises ``JaxpendError`` for nonsense."""
-        values = np.atleast_1d(np.asarray(values, float))
+    def numbers(self, name: str, values: Any) -> np.ndarray:
+        """The values (n,) in SI units. Raises ``JaxpendError`` for what makes no sense."""
+        try:
+            values = np.atleast_1d(np.asarray(values, float))
+        except (TypeError, ValueError):
+            raise JaxpendError(f"{name} is {values!r}; it must be numbers") from None
+        if values.ndim != 1 or not values.size:
+            shape = values.shape
+            raise JaxpendError(f"{name} has values of shape {shape}; give a list of some numbers")
         for value in values[~(np.isfinite(values) & (values >= self.least))]:
             rule = "finite" if not np.isfinite(value) else f"at least {self.least:g}"
             raise JaxpendError(f"{name} is {value} {self.unit}; it must be {rule}".rstrip())
+        return values
+
+    def checked(self, name: str, values: Any, dt: float) -> np.ndarray:
+        """The values (n,) as ``apply`` takes them. Raises as ``numbers``."""
+        values = self.numbers(name, values)
         if self.in_steps:
             return np.array([delay_steps(value, dt)[0] for value in values])
         return values
@@ -82,18 +98,42 @@ def _responsiveness(scenario, values, keys):
 
 
 def _delay(lagging: list[int]) -> Apply:
-    """Delay some of the measured components; the values are whole steps."""
-    return lambda scenario, values, keys: scenario.replace(
-        delay=(values[:, None] * np.array(lagging)).astype("i4")
-    )
+    """Let some of the measured components lag by at least so many steps."""
+
+    def apply(scenario, values, keys):
+        delay = (values[:, None] * np.array(lagging)).astype("i4")
+        if scenario.delay is not None:
+            delay = np.maximum(delay, scenario.delay)
+        return scenario.replace(delay=delay)
+
+    return apply
+
+
+_many_pulses = jax.jit(jax.vmap(random_pulses))
 
 
 def _perturbation(scenario, values, keys):
     """A random series of pulses for each key, its amplitudes times the value."""
-    pulses = jax.jit(jax.vmap(random_pulses))(keys)
+    pulses = _many_pulses(keys)
     pulses = jax.tree.map(lambda a: np.asarray(a, scenario.dtype), pulses)
     scale = values[:, None, None].astype(scenario.dtype)
     return scenario.replace(pulses=pulses.replace(amplitude=pulses.amplitude * scale))
+
+
+# How bad it gets on the v2 boards: the ends of every grid of the robustness benchmark. Those of
+# inertial parameters are factors of the nominal value.
+INERTIAL = (0.75, 1.25)
+RANGES: dict[str, tuple[float, float]] = {
+    "Ir": (0.0, 1e-4),
+    **dict.fromkeys(("m1r1", "I1", "m2r2", "m2", "I2"), INERTIAL),
+    **dict.fromkeys(("b1", "b2"), (-0.1, 0.1)),
+    **dict.fromkeys(("cf1", "cf2"), (-0.2, 0.2)),
+    "velocity_noise": (0.0, 0.5),
+    "torque_noise": (0.0, 1.1),
+    "responsiveness": (0.1, 2.0),
+    "delay": (0.0, 0.04),
+}
+LONGEST_DELAY = round(RANGES["delay"][1] / DT)  # steps
 
 
 VARIATIONS: dict[str, Variation] = {
@@ -111,21 +151,25 @@ VARIATIONS: dict[str, Variation] = {
     "l1": Variation(_plant("length", 0), "l₁", "m", 0),
     "l2": Variation(_plant("length", 1), "l₂", "m", 0),
     "gravity": Variation(_plant("gravity"), "gravity", "m/s²"),
-    "velocity_noise": Variation(_noise("measurement_noise", [2, 3]), "velocity noise", "rad/s", 0),
-    "position_noise": Variation(_noise("measurement_noise", [0, 1]), "position noise", "rad", 0),
-    "process_noise": Variation(
-        _noise("process_noise", [0, 1, 2, 3]), "process noise", "rad, rad/s", 0
+    "velocity_noise": Variation(
+        _noise("measurement_noise", [2, 3]), "velocity noise", "rad/s", 0, draws=True
     ),
-    "torque_noise": Variation(_torque_noise, "torque noise", "N m", 0),
+    "position_noise": Variation(
+        _noise("measurement_noise", [0, 1]), "position noise", "rad", 0, draws=True
+    ),
+    "process_noise": Variation(
+        _noise("process_noise", [0, 1, 2, 3]), "process noise", "rad, rad/s", 0, draws=True
+    ),
+    "torque_noise": Variation(_torque_noise, "torque noise", "N m", 0, draws=True),
     "responsiveness": Variation(_responsiveness, "torque response", "", 0),
     "delay": Variation(_delay([1, 1, 1, 1]), "delay", "s", 0, in_steps=True),
     "velocity_delay": Variation(_delay([0, 0, 1, 1]), "velocity delay", "s", 0, in_steps=True),
-    "perturbation": Variation(_perturbation, "perturbation strength", "", 0),
+    "perturbation": Variation(_perturbation, "perturbation strength", "", 0, draws=True),
 }
 
 
 def vary(
-    scenario: Scenario, changes: Mapping[str, Any], *, key: jax.Array, dt: float = 0.002
+    scenario: Scenario, changes: Mapping[str, Any], *, key: jax.Array, dt: float = DT
 ) -> Scenario:
     """A batch of n scenarios: the given one, with the i-th value of every change in the i-th.
 
@@ -145,13 +189,14 @@ def vary(
         for name, given in changes.items()
     }
     sizes = {len(v) for v in values.values()}
+    if not sizes:
+        raise JaxpendError("there are no changes; give at least one imperfection and its values")
     if len(sizes) != 1:
         raise JaxpendError(f"variations need as many values each; got {sorted(sizes)}")
 
     n = sizes.pop()
     keys = jax.random.split(key, (n, len(values)))
-    kept = lambda leaf: np.broadcast_to(leaf, (n, *np.shape(leaf)))  # noqa: E731
-    batch = jax.tree.map(kept, scenario)
+    batch = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (n, *np.shape(leaf))), scenario)
     for number, (name, its_values) in enumerate(values.items()):
         batch = VARIATIONS[name].apply(batch, its_values, keys[:, number])
     return batch
@@ -159,27 +204,26 @@ def vary(
 
 # --- at random ------------------------------------------------------------------------------
 
-LONGEST_DELAY = 20  # steps of 0.002 s
-# Ranges of the grids of jaxpend.robustness.
-_SPREAD = 0.25  # relative, of inertial parameters
-_DAMPING, _FRICTION, _MOTOR_INERTIA = 0.1, 0.2, 1e-4
-_VELOCITY_NOISE, _TORQUE_NOISE, _RESPONSE = 0.5, 1.1, (0.1, 2.0)
-
 
 def _vary_plant(plant: Plant, which: jax.Array, amount: jax.Array) -> Plant:
     """The plant with parameter ``which`` of ten (none if negative) off by ``amount`` in [-1, 1]."""
+
+    (_, motor_inertia), (_, damping), (_, friction) = (RANGES[n] for n in ("Ir", "b1", "cf1"))
+    spread = INERTIAL[1] - 1
+    coulomb = plant.coulomb_friction
+    coulomb = jnp.zeros_like(plant.damping) if coulomb is None else coulomb
 
     def off(number, joint):
         return jnp.where(which == number, amount, 0.0) * (np.arange(2) == joint)
 
     return plant.replace(
         motor_inertia=plant.motor_inertia
-        + jnp.where(which == 0, _MOTOR_INERTIA * (amount + 1) / 2, 0.0),
-        com=plant.com * (1 + _SPREAD * (off(1, 0) + off(5, 1))),
-        inertia=plant.inertia * (1 + _SPREAD * (off(2, 0) + off(7, 1))),
-        damping=plant.damping + _DAMPING * (off(3, 0) + off(8, 1)),
-        coulomb_friction=plant.coulomb_friction + _FRICTION * (off(4, 0) + off(9, 1)),
-        mass=plant.mass * (1 + _SPREAD * off(6, 1)),
+        + jnp.where(which == 0, motor_inertia * (amount + 1) / 2, 0.0),
+        com=plant.com * (1 + spread * (off(1, 0) + off(5, 1))),
+        inertia=plant.inertia * (1 + spread * (off(2, 0) + off(7, 1))),
+        damping=plant.damping + damping * (off(3, 0) + off(8, 1)),
+        coulomb_friction=coulomb + friction * (off(4, 0) + off(9, 1)),
+        mass=plant.mass * (1 + spread * off(6, 1)),
     )
 
 
@@ -196,11 +240,11 @@ def sample(plant: Plant, key: jax.Array, share: float = 1.0) -> Scenario:
     which = jnp.where(kind == 0, jax.random.randint(key_which, (), 0, 10), -1)
     amount = jax.random.uniform(key_amount, minval=-1.0, maxval=1.0)
     share = (amount + 1) / 2  # the same draw on [0, 1]
-    slow, fast = _RESPONSE
+    slow, fast = RANGES["responsiveness"]
     pulses: Pulses = random_pulses(key_pulses)
     delay = jnp.where(kind == 4, jnp.round(share * LONGEST_DELAY), 0).astype(jnp.int32)
-    noise = jnp.where(kind == 1, _VELOCITY_NOISE * share, 0.0)
-    torque_noise = jnp.where(kind == 2, _TORQUE_NOISE * share, 0.0)
+    noise = jnp.where(kind == 1, RANGES["velocity_noise"][1] * share, 0.0)
+    torque_noise = jnp.where(kind == 2, RANGES["torque_noise"][1] * share, 0.0)
     return Scenario(
         _vary_plant(plant, which, amount),
         measurement_noise=noise * jnp.array([0.0, 0.0, 1.0, 1.0]),

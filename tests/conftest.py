@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from jaxpend import JaxpendError
+from jaxpend.boards import Task, v2
 from jaxpend.plant import Plant
 
 hypothesis.settings.register_profile("jaxpend", deadline=None, max_examples=40, derandomize=True)
@@ -94,6 +95,11 @@ def limited_file_size(size: int):
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def task_of(robot: str) -> Task:
+    """The task of the v2 board."""
+    return v2(robot).task
 
 
 def shipped_network(bias: float = 0.0):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import refused, rewrite
+from conftest import refused, rewrite, task_of
 
 from jaxpend import JaxpendError, Policy, designs, leaderboard, load_policy, save_policy
 from jaxpend.cli import commands
@@ -19,7 +19,7 @@ from jaxpend.controllers.policy import network_in
 from jaxpend.pytree import pytree, static
 from jaxpend.score import official
 
-PLANT = designs.competition("pendubot")
+PLANT, TASK = designs.competition("pendubot"), task_of("pendubot")
 
 
 @pytree
@@ -49,11 +49,10 @@ def test_every_known_controller_comes_back_whole(tmp_path, name):
     same(load_controller(path, robot="pendubot"), made)
     with np.load(path, allow_pickle=False) as arrays:
         assert json.loads(str(arrays["header"]))["provenance"] == {"seed": 7}
-    # In the precision of the one who loads it; a network alone is float32 wherever it is.
-    if not isinstance(made, Policy):
-        with jax.enable_x64(True):
-            leaves = jax.tree.leaves(load_controller(path))
-            assert {str(leaf.dtype) for leaf in leaves} == {"float64"}
+    # In the precision of the one who loads it.
+    with jax.enable_x64(True):
+        leaves = jax.tree.leaves(load_controller(path))
+        assert {str(leaf.dtype) for leaf in leaves} == {"float64"}
 
 
 def test_policies_are_policy_files(tmp_path):
@@ -92,16 +91,16 @@ def test_what_a_file_cannot_hold_is_said(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda a, h: h.update(format=99), "has controller format 99"),
+        (lambda a, h: h.update(format=99), "has policy format 99"),
         (lambda a, h: h.update(robot="cartpole"), "unknown robot 'cartpole'"),
         (lambda a, h: h.update(robot="acrobot"), "for the acrobot, not for the pendubot"),
         (lambda a, h: h["controller"].update({"class": "Popen"}), "unknown class"),
         (lambda a, h: h["controller"].update({"class": "Plant"}), "not hold a whole controller"),
         (lambda a, h: h["controller"]["fields"].pop("goal"), "not hold a whole controller"),
-        (lambda a, h: h.update(controller=3), "not hold a whole controller"),
-        (lambda a, h: a.pop("gain"), "not hold a whole controller: KeyError('gain')"),
-        (lambda a, h: a.update(gain=a["gain"][:, :3]), "not hold a whole controller"),
-        (lambda a, h: a.update(gain=a["gain"] * np.nan), "or holds nan"),
+        (lambda a, h: h.update(controller=3), "int is no controller; a controller is a"),
+        (lambda a, h: a.pop("gain"), "does not hold a whole controller: 'gain'"),
+        (lambda a, h: a.update(gain=a["gain"][:, :3]), "LQR cannot be called: TypeError"),
+        (lambda a, h: a.update(gain=a["gain"] * np.nan), "holds a number that is NaN"),
         (lambda a, h: a.update(gain=a["gain"][:1], torque_limit=a["torque_limit"][:1]), "(2,)"),
     ],
 )
@@ -122,7 +121,7 @@ def test_commands_judge_a_controller_file(tmp_path, capsys):
     result = json.loads(capsys.readouterr().out)
     assert result["criteria"] == official(hybrid, "pendubot")["criteria"]
     assert result["header"]["provenance"] == {"seed": 1}
-    same(find_controller(path, None, PLANT, "pendubot"), hybrid)
+    same(find_controller(path, None, TASK), hybrid)
     title, make = leaderboard.chosen("lqr", path, "pendubot")["own_policy"]
     assert title == "hybrid"
     same(make(PLANT), hybrid)
@@ -134,22 +133,38 @@ def test_a_name_and_a_file_together(tmp_path):
     layers = ((jnp.ones((6, 3)), jnp.zeros(3)), (jnp.ones((3, 1)), jnp.zeros(1)))
     policy = Policy(layers, jnp.asarray(3.0, jnp.float32))
     save_controller(path, policy, "pendubot")
-    same(find_controller(None, None, PLANT, "pendubot"), load_policy("pendubot"))
-    same(find_controller(None, "pd", PLANT, "pendubot"), build("pd", PLANT, "pendubot"))
-    found = find_controller(path, "policy_lqr", PLANT, "pendubot")
+    same(find_controller(None, None, TASK), load_policy("pendubot"))
+    same(find_controller(None, "pd", TASK), build("pd", PLANT, "pendubot"))
+    found = find_controller(path, "policy_lqr", TASK)
     same(found, with_lqr(network_in(policy), PLANT, "pendubot"))
     with pytest.raises(JaxpendError, match=r"pd is not built around a policy; leave out .*policy"):
-        find_controller(path, "pd", PLANT, "pendubot")
+        find_controller(path, "pd", TASK)
     with pytest.raises(JaxpendError, match=r"unknown controller 'foo'; known: policy, .*tvlqr"):
-        find_controller(None, "foo", PLANT, "pendubot")
+        find_controller(None, "foo", TASK)
     save_controller(path, OWN, "pendubot")
     name = f"{__name__}:OWN"
-    same(find_controller(path, name, PLANT, "pendubot"), OWN)
-    assert find_controller(None, name, PLANT, "pendubot") is OWN
+    same(find_controller(path, name, TASK), OWN)
+    assert find_controller(None, name, TASK) is OWN
 
 
-def test_nominal_alone_is_no_controller(tmp_path):
+def test_a_reference_alone_is_no_controller(tmp_path):
     reference = Reference(jnp.zeros((3, 4)), jnp.zeros(2), jnp.zeros((2, 5)))
-    save_controller(tmp_path / "file.npz", reference, "pendubot")
-    with pytest.raises(JaxpendError, match="not hold a whole controller"):
-        load_controller(tmp_path / "file.npz")
+    with pytest.raises(JaxpendError, match="Reference is no controller; a controller is a"):
+        save_controller(tmp_path / "file.npz", reference, "pendubot")
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_of_earlier_versions_still_load(tmp_path):
+    path, made = tmp_path / "file.npz", build("tvlqr", PLANT, "pendubot")
+    save_controller(path, made, "pendubot")
+
+    def former(arrays, header):
+        text = json.dumps(header).replace('"Reference"', '"Nominal"')
+        text = text.replace('"reference"', '"nominal"').replace("reference.", "nominal.")
+        header.clear()
+        header.update(json.loads(text))
+        for name in [name for name in arrays if name.startswith("reference.")]:
+            arrays["nominal." + name.partition(".")[2]] = arrays.pop(name)
+
+    rewrite(path, former)
+    same(load_controller(path, robot="pendubot"), made)

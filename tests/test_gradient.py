@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, refused, shipped_network
+from conftest import assert_close, refused, shipped_network, task_of
 from jax.flatten_util import ravel_pytree
 
 from jaxpend import Policy, Scenario, designs, gradient
@@ -19,6 +19,7 @@ from jaxpend.scenario import Pulses
 from jaxpend.score import nominal, official, score_v2
 
 KEY = jax.random.key(0)
+TASK = task_of("pendubot")
 
 
 def network(robot="pendubot", width=5):
@@ -47,8 +48,8 @@ def test_gradient_agrees_with_finite_differences(robot, of):
         torque_noise=jnp.array([0.1, 0.1]), responsiveness=jnp.asarray(0.4),
     )  # fmt: skip
     function = {
-        "performance": lambda z: gradient.performance(config, rebuild(z), robot),
-        "robustness": lambda z: gradient.robustness(config, rebuild(z), wrong, KEY),
+        "performance": lambda z: gradient.performance(config, rebuild(z), task_of(robot)),
+        "robustness": lambda z: gradient.robustness(config, rebuild(z), wrong, KEY, task_of(robot)),
     }[of]
     function, slope = jax.jit(function), jax.jit(jax.grad(function))(z)
     for direction in np.random.default_rng(0).normal(size=(3, len(z))):
@@ -62,7 +63,9 @@ def test_a_fading_gradient_leaves_values_alone_and_shrinks_with_time():
 
     @partial(jax.jit, static_argnums=0)
     def after(integrate, x):
-        step = lambda x, _: (integrate(plant, x, jnp.array([0.0, 0.3]), 0.01), None)  # noqa: E731
+        def step(x, _):
+            return integrate(plant, x, jnp.array([0.0, 0.3]), 0.01), None
+
         return jax.lax.scan(step, x, length=5)[0]
 
     x, fading = jnp.array([0.3, -0.5, 1.0, 2.0]), gradient._fading(0.1)
@@ -83,15 +86,20 @@ def test_uprightness_is_highest_at_rest_on_any_turn_and_half_at_the_edge_of_succ
 
 def test_smooth_score_of_a_whole_run_is_nearly_the_official_one():
     config, policy = GradientConfig(duration=10.0), shipped_network()
-    smooth = jax.jit(lambda p: gradient.performance(config, p, "pendubot"))(policy)
+    smooth = jax.jit(lambda p: gradient.performance(config, p, TASK))(policy)
     np.testing.assert_allclose(smooth, official(policy, "pendubot")["score"], atol=2e-3)
 
 
 def toy_slope(monkeypatch, share=lambda scenario: 1.0):
     """``slope`` of objectives whose gradients are known: ones, and ``share`` in a scenario."""
-    total = lambda controller: ravel_pytree(controller.layers)[0].sum()  # noqa: E731
-    monkeypatch.setattr(gradient, "performance", lambda config, p, robot: total(p))
-    robustness = lambda config, p, scenario, key: share(scenario) * total(p)  # noqa: E731
+
+    def total(controller):
+        return ravel_pytree(controller.layers)[0].sum()
+
+    def robustness(config, p, scenario, key, task):
+        return share(scenario) * total(p)
+
+    monkeypatch.setattr(gradient, "performance", lambda config, p, task: total(p))
     monkeypatch.setattr(gradient, "robustness", robustness)
     return jax.jit(lambda *arguments: gradient.slope(*arguments), static_argnums=(0, 2))
 
@@ -101,13 +109,13 @@ def test_a_run_that_is_not_finite_is_left_out_and_counted(monkeypatch):
     start = network()
     z, _, _ = coordinates(start)
     config = GradientConfig(scenarios=20, scenario_weight=0.25, clip=1e9)
-    ascent, lost, metrics = slope(config, start, "pendubot", z, KEY)
+    ascent, lost, metrics = slope(config, start, TASK, z, KEY)
     assert 1 <= lost <= 10
     np.testing.assert_allclose(ascent, 0.75 * 1 + 0.25 * 2, rtol=1e-6)
     np.testing.assert_allclose(metrics["uprightness"], 2 * z.sum(), rtol=1e-5)
     # The nominal run too; and if nothing is left, nothing moves.
     gone = start.replace(layers=jax.tree.map(lambda leaf: leaf * jnp.nan, start.layers))
-    ascent, lost, _ = slope(config, gone, "pendubot", coordinates(gone)[0], KEY)
+    ascent, lost, _ = slope(config, gone, TASK, coordinates(gone)[0], KEY)
     assert lost == 21
     np.testing.assert_array_equal(ascent, 0)
 
@@ -117,9 +125,9 @@ def test_each_run_is_clipped_before_they_are_averaged(monkeypatch):
     start = network()
     z, _, _ = coordinates(start)
     plain = GradientConfig(clip=0.5)
-    assert_close(jnp.linalg.norm(slope(plain, start, "pendubot", z, KEY)[0]), 0.5)
+    assert_close(jnp.linalg.norm(slope(plain, start, TASK, z, KEY)[0]), 0.5)
     robust = GradientConfig(clip=0.5, scenarios=20, scenario_weight=1.0)
-    ascent, lost, _ = slope(robust, start, "pendubot", z, KEY)
+    ascent, lost, _ = slope(robust, start, TASK, z, KEY)
     assert lost == 0
     assert jnp.linalg.norm(ascent) < 0.5 * 10 / 20
 
@@ -127,20 +135,20 @@ def test_each_run_is_clipped_before_they_are_averaged(monkeypatch):
 def test_it_improves_the_policy_and_repeats_itself():
     off = shipped_network(bias=0.05)
     config = GradientConfig(steps=40, learning_rate=1e-4)
-    state, metrics = gradient.improve(config, off, gradient.init(config, off, KEY), 40, "pendubot")
+    state, metrics = gradient.improve(config, off, gradient.init(config, off, KEY), 40, TASK)
     smooth = np.asarray(metrics["smooth_score"])
     assert smooth[-1] > smooth[0] + 0.003
     found = gradient.current(config, off, state)
-    before, after = (float(score_v2(nominal(p, "pendubot"))) for p in (off, found))
+    before, after = (float(score_v2(nominal(p, TASK))) for p in (off, found))
     assert after > before + 0.003
     assert state.lost == 0
-    again, _ = gradient.improve(config, off, gradient.init(config, off, KEY), 40, "pendubot")
+    again, _ = gradient.improve(config, off, gradient.init(config, off, KEY), 40, TASK)
     np.testing.assert_array_equal(again.parameters, state.parameters)
 
 
 def test_jitted_as_eager():
     start, config = network(), GradientConfig(duration=0.1)
-    arguments = config, start, "pendubot", coordinates(start)[0], KEY
+    arguments = config, start, TASK, coordinates(start)[0], KEY
     eager, _, metrics = gradient.slope(*arguments)
     jitted, _, expected = jax.jit(gradient.slope, static_argnums=(0, 2))(*arguments)
     assert_close(jitted, eager)
@@ -153,7 +161,7 @@ def test_scenarios_come_from_the_key():
     ends = []
     for seed in (0, 0, 1):
         begun = gradient.init(config, start, jax.random.key(seed))
-        state, metrics = gradient.improve(config, start, begun, 1, "pendubot")
+        state, metrics = gradient.improve(config, start, begun, 1, TASK)
         ends.append((float(metrics["uprightness"][0]), np.asarray(state.parameters)))
     np.testing.assert_array_equal(ends[0][1], ends[1][1])
     assert ends[0][0] != ends[2][0]
@@ -165,7 +173,7 @@ def test_gains_of_any_controller_climb_with_a_step_of_their_own():
         steps=3, duration=0.5, gain_learning_rate=0.01, learning_rate=1.0, final_learning_rate=1.0
     )
     begun = gradient.init(config, start, KEY)
-    state, metrics = gradient.improve(config, start, begun, 3, "acrobot")
+    state, metrics = gradient.improve(config, start, begun, 3, task_of("acrobot"))
     # The first steps of Adam are as long as its rate.
     moved = np.abs(np.asarray(state.parameters))
     np.testing.assert_allclose(moved, 0.03, rtol=0.05)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import task_of
 from scipy.linalg import solve_discrete_are
 
 from jaxpend import JaxpendError, designs
@@ -78,7 +79,7 @@ def swing(robot="pendubot", dt=0.02, weight=10.0):
         weight * jnp.diag(jnp.array([1.0, 1.0, 0.1, 0.1, 0.1])),
         0.1,
         0.3,
-        joint=designs.active_joint(robot),
+        task=task_of(robot),
         dt=dt,
     )
 
@@ -198,14 +199,14 @@ def test_rejected_iteration_keeps_the_trajectory_and_grows_the_regularisation():
 def test_the_search_looks_within_its_torque_limit(monkeypatch):
     searched = []
 
-    def stop(plant, *_):
-        searched.append(plant.torque_limit)
+    def stop(task, *_):
+        searched.append(task.plant.torque_limit)
         raise StopIteration
 
     monkeypatch.setattr(optimise, "_coarse", stop)
     for search in (optimise.Search(), optimise.Search(torque_limit=1.5)):
         with pytest.raises(StopIteration):
-            optimise.find("acrobot", search)
+            optimise.find(task_of("acrobot"), search)
     np.testing.assert_array_equal(searched, [[0, 6.0], [0, 1.5]])
-    with pytest.raises(JaxpendError, match="torque limit is -1"):
-        optimise.find("acrobot", optimise.Search(torque_limit=-1.0))
+    with pytest.raises(JaxpendError, match="torque_limit is -1"):
+        optimise.find(task_of("acrobot"), optimise.Search(torque_limit=-1.0))

@@ -3,19 +3,23 @@
 import json
 import subprocess
 import sys
+import types
 
 import pytest
 
 from jaxpend import JaxpendError, designs, leaderboard
+from jaxpend.boards import v2
 from jaxpend.cli import commands
 from jaxpend.controllers import Zero, load_reference, tvlqr
 from jaxpend.robustness import CRITERIA
 
 
 def test_measured_and_published_rows_in_one_order():
-    make = lambda plant: tvlqr(plant, load_reference("pendubot"))  # noqa: E731
-    chosen = {"tvlqr": ("TVLQR", make), "zero": ("Nothing", lambda plant: Zero())}
-    board = leaderboard.leaderboard("pendubot", chosen, robustness=False)
+    chosen = {
+        "tvlqr": ("TVLQR", lambda plant: tvlqr(plant, load_reference("pendubot"))),
+        "zero": ("Nothing", lambda plant: Zero()),
+    }
+    board = leaderboard.leaderboard(v2("pendubot"), chosen, robustness=False)
     scores = [row["score"] for row in board["rows"]]
     assert scores == sorted(scores, reverse=True)
     first, last = board["rows"][0], board["rows"][-1]
@@ -34,16 +38,16 @@ def test_measured_and_published_rows_in_one_order():
 def test_robustness_is_part_of_the_row(monkeypatch):
     seen = {}
 
-    class Found:
-        overall, overall_by_key = 0.5, [0.5, 0.7, 0.6]
-        scores, scores_by_key = {"model": 1.0, "delay": 0.1}, {"delay": [0.1, 0.3, 0.2]}
+    found = types.SimpleNamespace(
+        overall=0.6, overall_by_key=[0.5, 0.7, 0.6], scores={"model": 1.0, "delay": 0.2}
+    )
 
-    def benchmark(controller, plant, key, *, keys):
-        seen.update(dtype=plant.mass.dtype, keys=keys)
-        return Found
+    def benchmark(controller, board, key, *, keys):
+        seen.update(dtype=board.task.plant.mass.dtype, keys=keys)
+        return found
 
     monkeypatch.setattr(leaderboard, "benchmark", benchmark)
-    row = leaderboard.judge(lambda plant: Zero(), "acrobot", keys=3)
+    row = leaderboard.judge(lambda plant: Zero(), v2("acrobot"), keys=3)
     assert row["robustness"] == 0.6
     assert row["robustness_criteria"] == {"model": 1.0, "delay": 0.2}
     assert (str(seen["dtype"]), seen["keys"]) == ("float32", 3)

@@ -1,6 +1,8 @@
 """Policies: what the network computes, and what a policy file does and does not hold."""
 
+import dataclasses
 import itertools
+import json
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,7 @@ import pytest
 from conftest import assert_close, both_robots, refused, rewrite
 
 from jaxpend import JaxpendError, Policy, load_policy, save_policy
-from jaxpend.controllers.policy import read_header
+from jaxpend.controllers.files import read_header
 from jaxpend.designs import active_joint
 from jaxpend.env import DoublePendulum, EnvConfig
 from jaxpend.observation import Observation
@@ -141,12 +143,33 @@ def test_file_round_trip(tmp_path, robot, history):
         assert all(value.dtype != object for value in arrays.values())
 
 
+def write_first_format(path, policy):
+    """A policy file as jaxpend 0.1 wrote it."""
+    header = {
+        "format": 1, "robot": policy.robot, "torque_limit": 3.0, "activation": policy.activation,
+        "observation": dataclasses.asdict(policy.observation), "control_dt": 0.01,
+        "layers": [policy.layers[0][0].shape[0], *(len(bias) for _, bias in policy.layers)],
+        "provenance": {"seed": 7},
+    }  # fmt: skip
+    arrays = {}
+    for i, (kernel, bias) in enumerate(policy.layers):
+        arrays |= {f"kernel{i}": kernel, f"bias{i}": bias}
+    np.savez(path, header=np.array(json.dumps(header)), **arrays)
+
+
+def test_files_of_the_first_format_still_load(tmp_path):
+    path, policy = tmp_path / "policy.npz", random_policy()
+    write_first_format(path, policy)
+    jax.tree.map(np.testing.assert_array_equal, load_policy(path), policy)
+    assert read_header(path)["provenance"] == {"seed": 7}
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda a, h: h.update(format=99), "has policy format 99"),
-        (lambda a, h: h.pop("torque_limit"), "lacks a part of a policy: 'torque_limit'"),
-        (lambda a, h: a.pop("kernel1"), "lacks a part of a policy: 'kernel1'"),
+        (lambda a, h: h.pop("torque_limit"), "not hold a whole controller: 'torque_limit'"),
+        (lambda a, h: a.pop("kernel1"), "not hold a whole controller: 'kernel1'"),
         (lambda a, h: h.update(layers=[6, 16, 9, 1]), "do not have the shapes"),
         (lambda a, h: a.update(bias0=np.zeros(3, "f4")), "do not have the shapes"),
         (lambda a, h: a.update(bias1=a["bias1"] * np.nan), "not finite or not positive"),
@@ -154,11 +177,19 @@ def test_file_round_trip(tmp_path, robot, history):
         (lambda a, h: h.update(robot="cartpole"), "unknown robot 'cartpole'"),
         (lambda a, h: h.update(activation="exp"), "unknown activation 'exp'"),
         (lambda a, h: h["observation"].update(kind="pixels"), "unknown observation kind"),
+        (lambda a, h: h.update(control_dt=-1.0), "the control period is -1.0 s; it must be in"),
+        (lambda a, h: h.update(control_dt=float("nan")), "the control period is nan s"),
+        (lambda a, h: h.update(control_dt=1e9), "the control period is 1000000000.0 s"),
+        (lambda a, h: a.update(bias1=a["bias1"] + np.inf), "not finite or not positive"),
+        (lambda a, h: h.update(layers="6"), "does not hold a whole controller"),
+        (lambda a, h: h.update(layers=[6, 10**9, 1]), "do not have the shapes"),
+        (lambda a, h: h.update(observation=[1]), "does not hold a whole controller"),
+        (lambda a, h: h.update(robot=["pendubot"]), "does not hold a whole controller"),
     ],
 )
 def test_damaged_contents_are_one_sentence(tmp_path, change, words):
     path = tmp_path / "policy.npz"
-    save_policy(path, random_policy())
+    write_first_format(path, random_policy())
     rewrite(path, change)
     with refused(words):
         load_policy(path)

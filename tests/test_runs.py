@@ -12,7 +12,7 @@ from conftest import limited_file_size, refused
 
 from jaxpend import JaxpendError, Policy, cli, load_policy
 from jaxpend.config import SNESRun, TrainRun
-from jaxpend.controllers.policy import read_header
+from jaxpend.controllers.files import read_header
 from jaxpend.runs.folder import RunFolder, from_mapping, load_config, to_mapping
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"

@@ -59,7 +59,7 @@ TRACKING = TVLQR(SWINGUP, jnp.ones((STEPS, 4)), lqr(PLANT, "acrobot"))
         (lqr(PLANT, "acrobot"), "all", {"gain": FACTOR}),
         (TRACKING, "all", {"gain": OVER_TIME, "top.gain": FACTOR}),
         (TRACKING, "top", {"top.gain": FACTOR}),
-        (riccati(PLANT, SWINGUP), "all", {"nominal.gain": OVER_TIME, "top.gain": FACTOR}),
+        (riccati(PLANT, SWINGUP), "all", {"reference.gain": OVER_TIME, "top.gain": FACTOR}),
         (
             energy_shaping(PLANT, "acrobot"),
             "all",

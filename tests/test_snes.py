@@ -7,15 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, refused, shipped_network
+from conftest import assert_close, refused, shipped_network, task_of
 
-from jaxpend import JaxpendError, Policy, designs, snes
-from jaxpend.controllers import load_reference, lqr, tvlqr
+from jaxpend import Policy, designs, snes
+from jaxpend.controllers import load_reference, tvlqr
 from jaxpend.controllers.hybrid import with_lqr
 from jaxpend.score import Criteria, official, performance, score_v2
 from jaxpend.snes import SNESConfig
 
 KEY = jax.random.key(0)
+TASK = task_of("pendubot")
 NETWORK = shipped_network()
 TOY = Policy(
     layers=((jnp.zeros((6, 3)), jnp.zeros(3)), (jnp.zeros((3, 1)), jnp.zeros(1))),
@@ -32,7 +33,7 @@ def distance(policy):
 def toy_fitness(monkeypatch):
     """A fitness that is largest where every parameter is 0.1, with one noise a generation."""
 
-    def fitness(config, policy, key, robot):
+    def fitness(config, policy, key, task):
         return jax.random.normal(key) - distance(policy), jnp.zeros((), jnp.int32)
 
     monkeypatch.setattr(snes, "fitness", fitness)
@@ -43,7 +44,7 @@ def toy_fitness(monkeypatch):
 
 def evolved(config, policy, generations):
     """State and metrics after some generations."""
-    return snes.evolve(config, policy, snes.init(config, policy, KEY), generations)
+    return snes.evolve(config, policy, snes.init(config, policy, KEY), generations, TASK)
 
 
 @pytest.mark.parametrize("strategy", list(snes.STRATEGIES))
@@ -57,7 +58,7 @@ def test_every_strategy_starts_at_the_controller_and_shrinks_as_told(toy_fitness
     for centre in (snes.mean_controller, snes.best_controller):
         jax.tree.map(assert_close, centre(config, start, state), start)
     before = state
-    state, metrics = snes.evolve(config, start, state, 4)
+    state, metrics = snes.evolve(config, start, state, 4, TASK)
     # Else it would be compiled a second time, for the second chunk.
     assert jax.tree.map(jax.typeof, state) == jax.tree.map(jax.typeof, before)
     # From 0.02 to a thousandth of it; they adapt sigma as well, and Open-ES is a generation late.
@@ -78,7 +79,7 @@ def test_the_search_climbs_the_fitness(toy_fitness, strategy):
 def test_lm_ma_es_remembers_where_the_good_ones_were(toy_fitness):
     config = SNESConfig(population=20, sigma=0.03, strategy="lm_ma_es")
     begun = snes.init(config, TOY, KEY)
-    state, _ = snes.evolve(config, TOY, begun, 1)
+    state, _ = snes.evolve(config, TOY, begun, 1, TASK)
     moved, memory = state.strategy.mean - begun.strategy.mean, state.strategy.M[0]
     along = jnp.dot(moved, memory) / jnp.linalg.norm(moved) / jnp.linalg.norm(memory)
     assert_close(along, 1.0, times=10)
@@ -88,7 +89,7 @@ def test_best_individual_is_the_one_with_the_best_fitness_so_far(toy_fitness):
     config = SNESConfig(generations=5, population=6)
     state, metrics = snes.init(config, TOY, KEY), []
     for _ in range(5):
-        state, row = snes.evolve(config, TOY, state, 1)
+        state, row = snes.evolve(config, TOY, state, 1, TASK)
         assert row["max_fitness"] >= row["mean_fitness"]
         metrics.append(float(row["max_fitness"][0]))
         assert_close(state.best_fitness, max(metrics))
@@ -116,8 +117,8 @@ def test_gains_are_searched_in_units_of_themselves(monkeypatch):
     """The optimum is 20 % above every gain; weights and gains start with a sigma of their own."""
     start = with_lqr(TOY, designs.competition("pendubot"), "pendubot")
 
-    def fitness(config, found, key, robot):
-        assert robot == "pendubot"
+    def fitness(config, found, key, task):
+        assert task == TASK
         ratio = found.top.gain[0] / (1.2 * start.top.gain[0])
         return -jnp.sum(jnp.log(ratio) ** 2), jnp.zeros((), jnp.int32)
 
@@ -126,7 +127,7 @@ def test_gains_are_searched_in_units_of_themselves(monkeypatch):
     config = SNESConfig(generations=30, population=20, sigma=0.02, gain_sigma=0.05)
     state = snes.init(config, start, KEY)
     assert_close(state.strategy.std, np.repeat([0.02, 0.05], [25, 10]))
-    state, _ = snes.evolve(config, start, state, 30, "pendubot")
+    state, _ = snes.evolve(config, start, state, 30, TASK)
     snes.evolve.clear_cache()
     for centre in (snes.mean_controller, snes.best_controller):
         found = centre(config, start, state)
@@ -136,7 +137,9 @@ def test_gains_are_searched_in_units_of_themselves(monkeypatch):
 
 
 def test_sigma_decays_to_its_final_fraction(monkeypatch):
-    flat = lambda config, policy, key, robot: (jnp.zeros(()), jnp.zeros((), jnp.int32))  # noqa: E731
+    def flat(config, policy, key, task):
+        return jnp.zeros(()), jnp.zeros((), jnp.int32)
+
     monkeypatch.setattr(snes, "fitness", flat)
     sigmas = {}
     for final in (1.0, 0.25):
@@ -150,12 +153,12 @@ def test_sigma_decays_to_its_final_fraction(monkeypatch):
 
 
 def test_an_individual_that_is_nan_is_last_and_counted_and_poisons_nothing(monkeypatch):
-    def fitness(config, policy, key, robot):
+    def fitness(config, policy, key, task):
         sick = policy.layers[0][1][0] > 0
         kernel = jnp.where(sick, jnp.nan, policy.layers[0][0])
         layers = ((kernel, policy.layers[0][1]), policy.layers[1])
-        plant = designs.competition(policy.robot)
-        c = performance(policy.replace(layers=layers), plant, key, duration=0.02)
+        brief = dataclasses.replace(task, duration=0.02)
+        c = performance(policy.replace(layers=layers), task.plant, key, brief)
         score = score_v2(dataclasses.replace(c, swingup_time=0.0, success=c.tau_cost >= 0))
         return score, jnp.sum(~jnp.isfinite(c.velocity_cost))
 
@@ -187,58 +190,55 @@ QUIET = SNESConfig(action_noise=0.0, rollouts=3)
 
 
 def test_fitness_without_noise_is_the_official_score(fit):
-    score, diverged = fit(QUIET, NETWORK, KEY)
+    score, diverged = fit(QUIET, NETWORK, KEY, TASK)
     np.testing.assert_allclose(score, official(NETWORK, "pendubot")["score"], atol=2e-3)
     assert diverged == 0
-    np.testing.assert_array_equal(fit(QUIET, NETWORK, jax.random.key(1))[0], score)
-    score, diverged = fit(QUIET, lost(NETWORK), KEY)
+    np.testing.assert_array_equal(fit(QUIET, NETWORK, jax.random.key(1), TASK)[0], score)
+    score, diverged = fit(QUIET, lost(NETWORK), KEY, TASK)
     assert (float(score), int(diverged)) == (0.0, 1)
 
 
 def test_fitness_is_the_mean_over_rollouts_with_noisy_actions(fit):
     config = SNESConfig(action_noise=0.05, rollouts=2)
-    score, diverged = fit(config, NETWORK, KEY)
-    quiet, _ = fit(QUIET, NETWORK, KEY)
+    score, diverged = fit(config, NETWORK, KEY, TASK)
+    quiet, _ = fit(QUIET, NETWORK, KEY, TASK)
     assert 0 < score < quiet - 0.01  # noise costs smoothness
     assert diverged == 0
-    np.testing.assert_array_equal(fit(config, NETWORK, KEY)[0], score)
-    assert fit(config, NETWORK, jax.random.key(1))[0] != score
+    np.testing.assert_array_equal(fit(config, NETWORK, KEY, TASK)[0], score)
+    assert fit(config, NETWORK, jax.random.key(1), TASK)[0] != score
     # Lost runs are worth nothing, and each of them is counted.
-    score, diverged = fit(config, lost(NETWORK), KEY)
+    score, diverged = fit(config, lost(NETWORK), KEY, TASK)
     assert (float(score), int(diverged)) == (0.0, 2)
 
 
 def test_scenarios_have_their_weight_in_the_fitness(monkeypatch):
     perfect = Criteria(*jnp.zeros((9, 5)), success=jnp.arange(5) > 1)  # score 1 in three of five
 
-    def imperfect(controller, plant, key, count):
+    def imperfect(controller, task, key, count):
         assert controller is NETWORK
         assert count == 5
         return perfect
 
     monkeypatch.setattr(snes, "imperfect", imperfect)
     config = dataclasses.replace(QUIET, scenarios=5, scenario_weight=0.25)
-    score, _ = jax.jit(partial(snes.fitness, config, NETWORK))(KEY)
+    score, _ = jax.jit(partial(snes.fitness, config, NETWORK, task=TASK))(KEY)
     nominal = official(NETWORK, "pendubot")["score"]
     np.testing.assert_allclose(score, 0.75 * nominal + 0.25 * 0.6, atol=2e-3)
 
 
 def test_any_controller_has_a_fitness_and_only_policies_have_action_noise(fit):
     plant = designs.competition("pendubot")
-    holding = lqr(plant, "pendubot")
-    with pytest.raises(JaxpendError, match="LQR does not know its robot"):
-        snes.fitness(QUIET, holding, KEY)
     noisy = SNESConfig(action_noise=0.3, rollouts=2)
     hybrid = with_lqr(NETWORK, plant, "pendubot")
-    quiet, _ = fit(QUIET, hybrid, KEY, "pendubot")
+    quiet, _ = fit(QUIET, hybrid, KEY, TASK)
     np.testing.assert_allclose(quiet, official(hybrid, "pendubot")["score"], atol=2e-3)
-    assert 0 < fit(noisy, hybrid, KEY, "pendubot")[0] < quiet - 0.01
+    assert 0 < fit(noisy, hybrid, KEY, TASK)[0] < quiet - 0.01
     # No policy, no noise: one rollout, that counts once if it is lost.
     tracking = tvlqr(plant, load_reference("pendubot"))
-    score, diverged = fit(noisy, tracking, KEY, "pendubot")
+    score, diverged = fit(noisy, tracking, KEY, TASK)
     np.testing.assert_allclose(score, official(tracking, "pendubot")["score"], atol=2e-3)
     sick = tracking.replace(gain=tracking.gain * jnp.nan)
-    score, diverged = fit(noisy, sick, KEY, "pendubot")
+    score, diverged = fit(noisy, sick, KEY, TASK)
     assert (float(score), int(diverged)) == (0.0, 1)
 
 
@@ -247,14 +247,14 @@ def test_a_generation_meets_one_noise_and_improves_the_policy(fit):
     config = SNESConfig(generations=10, population=12, sigma=0.003, action_noise=0.02)
     # Common random numbers: individuals that are equal to rounding are equally fit.
     alike = snes.init(dataclasses.replace(config, sigma=1e-20), off, KEY)
-    _, metrics = snes.evolve(config, off, alike, 10)
+    _, metrics = snes.evolve(config, off, alike, 10, TASK)
     np.testing.assert_allclose(metrics["max_fitness"], metrics["mean_fitness"], rtol=1e-6)
     assert len(np.unique(metrics["max_fitness"])) == 10  # new noise in every generation
     state, metrics = evolved(dataclasses.replace(config, generations=25, sigma=0.001), off, 25)
     means = np.asarray(metrics["mean_fitness"])
     assert means[-3:].mean() > means[:3].mean() + 0.003
     found = snes.mean_controller(config, off, state)
-    assert fit(QUIET, found, KEY)[0] > fit(QUIET, off, KEY)[0]
+    assert fit(QUIET, found, KEY, TASK)[0] > fit(QUIET, off, KEY, TASK)[0]
     assert state.diverged == 0
 
 

@@ -21,7 +21,8 @@ from jaxpend import Policy, cli, designs, load_policy, save_policy
 from jaxpend.config import GradientConfig, GradientRun, SACRun, SNESConfig, SNESRun, TrainRun
 from jaxpend.controllers import Guarded, load_controller
 from jaxpend.controllers.catalogue import build
-from jaxpend.controllers.policy import network_in, read_header
+from jaxpend.controllers.files import read_header
+from jaxpend.controllers.policy import network_in
 from jaxpend.score import official
 from jaxpend.train.interrupt import Stopped
 from jaxpend.train.loop import stages_of, train

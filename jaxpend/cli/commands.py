@@ -107,8 +107,7 @@ def score(robot: str = "pendubot", policy: str | None = None, json: str | None =
     active_joint(robot)
     import jax
 
-    from ..controllers.files import load_controller
-    from ..controllers.policy import read_header
+    from ..controllers.files import load_controller, read_header
     from ..score import official
     from ..terminal import score_table
 
@@ -162,15 +161,16 @@ def robustness(
         raise JaxpendError(f"worst is {worst}; it must not be negative")
     import jax
 
-    from .. import designs
+    from .. import boards
     from ..controllers.catalogue import find_controller
     from ..robustness import benchmark, nominal_and_worst, success_map
     from ..sweep import mildest_failure
     from ..terminal import robustness_table
 
     with jax.enable_x64(precision == "float64"):
-        plant = designs.competition(robot, torque_limit)
-        judged = find_controller(policy, controller, plant, robot)
+        task = dataclasses.replace(boards.v2(robot).task, torque_limit=torque_limit)
+        plant = task.plant
+        judged = find_controller(policy, controller, task)
         key = jax.random.key(seed)
         result = {"robot": robot, "controller": controller or policy or robot, "seed": seed}
         result |= {"precision": precision, "torque_limit": torque_limit}
@@ -213,12 +213,13 @@ def leaderboard(
     """
     active_joint(robot)
     from .. import leaderboard as boards
+    from ..boards import v2
     from ..terminal import console
 
     chosen = boards.chosen(controllers, policy, robot)
     say = lambda line: console.print(line, style="dim")  # noqa: E731
     options = {"robustness": robustness, "keys": keys, "seed": seed}
-    board = boards.leaderboard(robot, chosen, say=say, **options)
+    board = boards.leaderboard(v2(robot), chosen, say=say, **options)
     boards.show(board)
     emit_json(board, json)
     if out is not None:
@@ -241,6 +242,7 @@ def optimise(
     """
     import jax
 
+    from ..boards import v2
     from ..trajopt.reference import save_reference
     from ..trajopt.search import find
 
@@ -249,7 +251,7 @@ def optimise(
         f"[{time.perf_counter() - start:5.0f} s] {line}", file=sys.stderr, flush=True
     )
     with jax.enable_x64(True):
-        found = find(robot, search, say=say)
+        found = find(v2(robot).task, search, say=say)
     for _, report in found:
         seconds, turns = report["criteria"]["swingup_time"], report["turns_of_theta2"]
         say(f"score {report['score']:.4f}, up after {seconds:.2f} s, turns of theta2 {turns:+d}")

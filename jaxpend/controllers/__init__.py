@@ -3,13 +3,13 @@
 from ..controller import Controller, Feedback, OpenLoop, Zero
 from ..trajopt.reference import Reference, load_reference, save_reference
 from .energy import EnergyShaping, energy_shaping
-from .files import load_controller, save_controller
+from .files import load_controller, load_policy, save_controller, save_policy
 from .guard import Guarded, guard
 from .hybrid import Ellipsoid, Hybrid, Tolerances, ellipsoid, ellipsoid_of_torque
 from .lqr import LQR, delay_tolerant, lqr
 from .mpc import MPC, free_mpc, tracking_mpc
 from .pd import PD, pd
-from .policy import Policy, load_policy, save_policy
+from .policy import Policy
 from .riccati import Riccati, riccati
 from .tvlqr import TVLQR, tvlqr
 

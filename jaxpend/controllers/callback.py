@@ -1,4 +1,4 @@
-"""Any Python function of the measured state as a controller: slow, but through the same door."""
+"""Any Python function of the measured state as a controller: slow, but judged like all others."""
 
 from collections.abc import Callable
 
@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..controller import Memoryless
+from ..errors import JaxpendError, blame
 from ..pytree import pytree, static
 
 __all__ = ["PythonLaw"]
@@ -30,12 +31,28 @@ class PythonLaw(Memoryless):
 
     def _call(self, t: np.ndarray, x: np.ndarray) -> np.ndarray:
         t, x = np.asarray(t), np.asarray(x)
-        shape = (*x.shape[:-1], 2)
-        if self.batched:
-            u = self.law(t.reshape(-1), x.reshape(-1, 4))
-        else:
-            u = [self.law(float(a), b) for a, b in zip(t.ravel(), x.reshape(-1, 4), strict=True)]
-        return np.asarray(u, x.dtype).reshape(shape)
+        name = getattr(self.law, "__name__", "the law")
+        try:
+            if self.batched:
+                u = self.law(t.reshape(-1), x.reshape(-1, 4))
+            else:
+                times, states = t.ravel(), x.reshape(-1, 4)
+                u = [self.law(float(a), b) for a, b in zip(times, states, strict=True)]
+            torque = np.asarray(u, x.dtype)
+        except Exception as error:  # the law is the user's, and may raise anything
+            raise JaxpendError(f"{name} cannot be called: {blame(error)}") from None
+        if torque.shape != (t.size, 2):
+            shape = torque.shape if self.batched else torque.shape[1:]
+            wanted = f"({t.size}, 2)" if self.batched else "(2,)"
+            raise JaxpendError(f"{name} returns a torque of shape {shape}; it must be {wanted}")
+        return torque.reshape(*x.shape[:-1], 2)
+
+    def check(self) -> None:
+        """Call the law once, hanging at rest. Raises ``JaxpendError`` if it gives no torque."""
+        if not callable(self.law):
+            raise JaxpendError(f"{self.law!r} is no function of (t, x); write one that is")
+        if not np.isfinite(self._call(np.zeros(1, "f4"), np.zeros((1, 4), "f4"))).all():
+            raise JaxpendError("the law gives a torque that is not finite, hanging at rest")
 
     def __call__(self, carry, t, x):
         """The law's torque, (2,)."""

@@ -1,4 +1,4 @@
-"""The controllers that this package knows by name, ready to be judged."""
+"""The catalogue: the controllers that this package has by name, ready to be judged."""
 
 import dataclasses
 import importlib
@@ -8,19 +8,20 @@ from pathlib import Path
 
 import jax.numpy as jnp
 
-from ..controller import Controller, OpenLoop
-from ..errors import JaxpendError, choose
+from ..boards import Task
+from ..controller import Controller, OpenLoop, check_controller, check_robot
+from ..errors import JaxpendError, blame, choose
 from ..plant import Plant
 from ..trajopt.reference import load_reference
 from .callback import PythonLaw
 from .energy import energy_shaping
-from .files import classes_of, load_controller
+from .files import classes_of, load_controller, load_policy
 from .guard import guard
 from .hybrid import with_lqr
 from .lqr import lqr
 from .mpc import free_mpc, tracking_mpc
 from .pd import pd
-from .policy import change_policies, load_policy, network_in
+from .policy import change_policies, network_in
 from .riccati import riccati
 from .tvlqr import tvlqr
 
@@ -83,28 +84,27 @@ def build(name: str, plant: Plant, robot: str) -> Controller:
     return CATALOGUE[choose("controller", name, CATALOGUE)].make(plant, robot)
 
 
-def find_controller(
-    policy: str | Path | None, controller: str | None, plant: Plant, robot: str
-) -> Controller:
+def find_controller(policy: str | Path | None, controller: str | None, task: Task) -> Controller:
     """What ``--policy`` and ``--controller`` of a command name.
 
     Args:
         policy: a policy or controller file; None: the policy that ships with the package.
-        controller: a known name; or ``module:name``, a controller or a Python function, looked
-            for in the working directory too. With ``policy`` as well: the known controller
-            around that policy, or a file of the classes that ``module:name`` is made of.
-        plant: what a known controller is made for; its type is the precision.
-        robot: "acrobot" or "pendubot".
+        controller: a name in the catalogue; or ``module:name``, a controller or a Python
+            function, looked for in the working directory too. With ``policy`` as well: that of
+            the catalogue around that policy, or a file of the classes of ``module:name``.
+        task: gives the robot, and the nominal plant that a controller of the catalogue is for.
 
     Raises:
         JaxpendError: a file, a name or a module that cannot be used.
     """
+    robot = task.robot
     if not controller:
         return load_controller(policy or robot, robot=robot)
     if ":" in controller:
         own = _imported(controller)
+        check_robot(own, robot)
         return load_controller(policy, robot=robot, classes=classes_of(own)) if policy else own
-    found = build(controller, plant, robot)
+    found = build(controller, task.plant, robot)
     if not policy:
         return found
     given = network_in(load_policy(policy, robot=robot), policy)
@@ -119,6 +119,9 @@ def _imported(name: str) -> Controller:
     sys.path.insert(0, str(Path.cwd()))
     try:
         found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise JaxpendError(f"cannot load {name} as module:name: {error}") from None
-    return found if hasattr(found, "reset") else PythonLaw(found)
+    except Exception as error:  # the module is the user's, and may raise anything
+        raise JaxpendError(f"cannot load {name} as module:name: {blame(error)}") from None
+    if not isinstance(found, type) and not hasattr(found, "reset") and callable(found):
+        found = PythonLaw(found)
+    check_controller(found)
+    return found

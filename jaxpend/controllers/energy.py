@@ -23,9 +23,8 @@ import numpy as np
 
 from ..controller import Memoryless
 from ..designs import active_joint
-from ..plant import Plant, dynamics, mass_matrix, total_energy
+from ..plant import UPRIGHT, Plant, deviation, dynamics, mass_matrix, total_energy
 from ..pytree import pytree, static
-from .lqr import deviation
 from .search_space import FACTOR
 
 __all__ = ["EnergyShaping", "energy_shaping"]
@@ -55,7 +54,7 @@ class EnergyShaping(Memoryless):
     def __call__(self, carry, t, x):
         """Torque (2,), N m, zero on the passive joint."""
         plant, a = self.plant, self.joint
-        upright = jnp.array([jnp.pi, 0.0, 0.0, 0.0], x.dtype)
+        upright = jnp.array(UPRIGHT, x.dtype)
         wanted_energy = total_energy(plant, upright)
         if self.surplus is not None:
             triangle = 1 - jnp.abs(2 * jnp.mod(t / PERIOD, 1) - 1)

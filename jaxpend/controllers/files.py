@@ -1,11 +1,13 @@
-"""Files of whole controllers: their arrays by key path, and a header that says how they fit.
+"""Files of controllers, policies among them: arrays by key path, and a header of how they fit.
 
 The header names classes and fields; only the package's own classes, and those that the caller
-gives, are made from it, so that a file cannot run code. A ``Policy`` keeps its own format.
+gives, are made from it, so that a file cannot run code.
 """
 
 import dataclasses
+import math
 from collections.abc import Iterable
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..arrays import read_arrays, write_arrays
-from ..controller import Controller, OpenLoop, Zero
+from ..controller import Controller, OpenLoop, Zero, check_controller, robot_of
 from ..errors import JaxpendError, choose
 from ..observation import Observation
 from ..plant import Plant
@@ -27,19 +29,27 @@ from .hybrid import Ellipsoid, Hybrid, Tolerances
 from .lqr import LQR
 from .mpc import MPC
 from .pd import PD
-from .policy import Policy, load_policy, save_policy
+from .policy import ACTIVATIONS, Policy, network_in, policies_in
 from .riccati import Riccati
 from .tvlqr import TVLQR
 
-__all__ = ["classes_of", "load_controller", "save_controller"]
+__all__ = [
+    "classes_of",
+    "load_controller",
+    "load_policy",
+    "read_header",
+    "save_controller",
+    "save_policy",
+]
 
 FORMAT = 1
 # What files of earlier versions call classes and fields.
 FORMER = {"Nominal": "Reference", "nominal": "reference"}
 CLASSES = (
-    EnergyShaping, Ellipsoid, Guarded, Hybrid, LQR, MPC, Reference, Observation, Observer, OpenLoop,
-    PD, Plant, Policy, Rescue, Riccati, Solution, TVLQR, Tolerances, Zero,
+    EnergyShaping, Ellipsoid, Guarded, Hybrid, LQR, MPC, Observation, Observer, OpenLoop, PD,
+    Plant, Policy, Reference, Rescue, Riccati, Solution, TVLQR, Tolerances, Zero,
 )  # fmt: skip
+SLOWEST = 1.0  # s, the longest control period that a policy may say it was trained at
 
 
 def classes_of(value: Any) -> set[type]:
@@ -50,6 +60,9 @@ def classes_of(value: Any) -> set[type]:
         return set()
     parts = (getattr(value, f.name) for f in dataclasses.fields(value))
     return {type(value)}.union(*map(classes_of, parts))
+
+
+# --- writing -------------------------------------------------------------------------------
 
 
 def _described(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
@@ -70,6 +83,42 @@ def _described(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     return {"array": path}
 
 
+def save_controller(
+    path: str | Path, controller: Controller, robot: str, provenance: dict[str, Any] | None = None
+) -> None:
+    """Write a controller file, atomically: .npz without pickle.
+
+    Args:
+        path: of the file.
+        controller: any that is made of dataclasses, arrays, numbers and text.
+        robot: "acrobot" or "pendubot".
+        provenance: any JSON object: command, seed, scores, ...
+
+    Raises:
+        JaxpendError: it is no controller, or holds something else.
+    """
+    choose("robot", robot, ROBOTS)
+    check_controller(controller)
+    arrays: dict[str, np.ndarray] = {}
+    header = {"format": FORMAT, "kind": "controller", "robot": robot}
+    header |= {"controller": _described(controller, "", arrays), "provenance": provenance or {}}
+    write_arrays(path, header, arrays)
+
+
+def save_policy(
+    path: str | Path, policy: Controller, provenance: dict[str, Any] | None = None
+) -> None:
+    """``save_controller`` for a ``Policy``, or a controller with one in it, such as a ``Guarded``.
+
+    Raises:
+        JaxpendError: a controller with no policy in it; use ``save_controller``.
+    """
+    save_controller(path, policy, network_in(policy).robot, provenance)
+
+
+# --- reading -------------------------------------------------------------------------------
+
+
 def _made(tree: Any, arrays: dict[str, np.ndarray], classes: dict[str, type]) -> Any:
     """What ``_described`` described."""
     if isinstance(tree, list):
@@ -86,20 +135,60 @@ def _made(tree: Any, arrays: dict[str, np.ndarray], classes: dict[str, type]) ->
     return kind(**{name: _made(part, arrays, classes) for name, part in fields.items()})
 
 
-def save_controller(
-    path: str | Path, controller: Controller, robot: str, provenance: dict[str, Any] | None = None
-) -> None:
-    """Write a controller file, atomically: .npz without pickle, as ``save_policy`` for a policy.
+def _first_format(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Policy:
+    """A policy alone, as jaxpend 0.1 wrote it: arrays kernel0, bias0, ..."""
+    count = len(header["layers"]) - 1
+    policy = Policy(
+        layers=tuple(
+            (jnp.asarray(arrays[f"kernel{i}"]), jnp.asarray(arrays[f"bias{i}"]))
+            for i in range(count)
+        ),
+        torque_limit=jnp.asarray(header["torque_limit"], jnp.float32),
+        robot=header["robot"],
+        observation=Observation(**header["observation"]),
+        activation=header["activation"],
+        control_dt=float(header["control_dt"]),
+    )
+    sizes = [policy.layers[0][0].shape[0], *(bias.shape[0] for _, bias in policy.layers)]
+    if sizes != header["layers"]:
+        raise JaxpendError("the arrays do not have the shapes that its header says")
+    return policy
 
-    Raises:
-        JaxpendError: it holds what is neither array, number, text nor dataclass of those.
-    """
-    if isinstance(controller, Policy):
-        return save_policy(path, controller, provenance)
-    arrays: dict[str, np.ndarray] = {}
-    header = {"format": FORMAT, "kind": "controller", "robot": robot}
-    header |= {"controller": _described(controller, "", arrays), "provenance": provenance or {}}
-    return write_arrays(path, header, arrays)
+
+def _check_policy(policy: Policy) -> None:
+    """Refuse a policy with values that no training could have left."""
+    choose("robot", policy.robot, ROBOTS)
+    choose("activation", policy.activation, ACTIVATIONS)
+    if not isinstance(policy.observation, Observation):
+        raise JaxpendError("the policy says nothing of its observation")
+    period = policy.control_dt
+    if isinstance(period, bool) or not (
+        isinstance(period, int | float) and math.isfinite(period) and 0 < period <= SLOWEST
+    ):
+        raise JaxpendError(f"the control period is {period} s; it must be in 0 to {SLOWEST:g} s")
+    sizes = [kernel.shape[:1] + bias.shape for kernel, bias in policy.layers]
+    fits = all(k.shape == size for (k, _), size in zip(policy.layers, sizes, strict=True))
+    fits &= sizes[0][0] == policy.observation.size and sizes[-1][1:] == (1,)
+    if not fits:
+        raise JaxpendError("the layers do not fit the observation and one action")
+    finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policy))
+    if not (finite and policy.torque_limit > 0):
+        raise JaxpendError("the policy holds values that are not finite or not positive")
+
+
+def _locate(robot_or_path: str | Path) -> Path:
+    if str(robot_or_path) not in ROBOTS:
+        return Path(robot_or_path)
+    return Path(str(resources.files("jaxpend").joinpath(f"policies/{robot_or_path}.npz")))
+
+
+def read_header(robot_or_path: str | Path) -> dict[str, Any]:
+    """The JSON header of a policy or controller file. Raises as ``arrays.read_arrays``."""
+    path = _locate(robot_or_path)
+    header, _ = read_arrays(path, "policy")
+    if header.get("robot") not in (*ROBOTS,) or not isinstance(header.get("provenance", {}), dict):
+        raise JaxpendError(f"{path} is not a policy file: its header does not say what it is of")
+    return header
 
 
 def load_controller(
@@ -107,8 +196,7 @@ def load_controller(
 ) -> Controller:
     """Load a policy or controller file, or by a robot's name the policy that ships.
 
-    The arrays of a controller have jax's default float type at the time of the call; a policy's
-    are float32.
+    The arrays have jax's default float type at the time of the call.
 
     Args:
         robot_or_path: a path, or the name of a robot.
@@ -116,31 +204,40 @@ def load_controller(
         classes: a user's own, beside the package's.
 
     Raises:
-        JaxpendError: no such file, not a controller file, one for the other robot, or a class
-            that is not known.
+        JaxpendError: no such file, not a controller file, one for the other robot, a class that
+            is not known, or values that make no sense.
     """
-    path = Path(robot_or_path)
-    if str(robot_or_path) in ROBOTS:
-        return load_policy(robot_or_path, robot=robot)
+    path = _locate(robot_or_path)
     header, arrays = read_arrays(path, "policy")
-    if header.get("kind") != "controller":
-        return load_policy(path, robot=robot)
     if header.get("format") != FORMAT:
-        raise JaxpendError(
-            f"{path} has controller format {header.get('format')}; this reads {FORMAT}"
-        )
+        raise JaxpendError(f"{path} has policy format {header.get('format')}; this reads {FORMAT}")
     known = {kind.__name__: kind for kind in (*CLASSES, *classes)}
     try:
-        controller = _made(header["controller"], arrays, known)
         its_robot = choose("robot", header["robot"], ROBOTS)
-        act = lambda c: c(c.reset(jax.random.key(0)), jnp.zeros(()), jnp.zeros(4))[1]  # noqa: E731
-        shape = jax.eval_shape(act, controller).shape
-    except JaxpendError:
-        raise
-    except Exception as error:  # whatever a controller raises for arrays that do not fit
-        raise JaxpendError(f"{path} does not hold a whole controller: {error!r}") from None
-    if shape != (2,) or any(np.isnan(a).any() for a in arrays.values() if a.dtype.kind == "f"):
-        raise JaxpendError(f"{path}: the controller gives no torques (2,), or holds nan")
+        if header.get("kind") == "controller":
+            controller = _made(header["controller"], arrays, known)
+        else:
+            controller = _first_format(header, arrays)
+        for policy in policies_in(controller):
+            _check_policy(policy)
+        check_controller(controller)
+    except JaxpendError as error:
+        raise JaxpendError(f"{path}: {error}") from None
+    except Exception as error:  # whatever a class raises for values that do not fit
+        said = (str(error) or type(error).__name__).splitlines()[0]
+        raise JaxpendError(f"{path} does not hold a whole controller: {said}") from None
+    what = "policy" if isinstance(controller, Policy) else "controller"
     if robot is not None and its_robot != choose("robot", robot, ROBOTS):
-        raise JaxpendError(f"{path} is a controller for the {its_robot}, not for the {robot}")
+        raise JaxpendError(f"{path} is a {what} for the {its_robot}, not for the {robot}")
+    if (robot_of(controller) or its_robot) != its_robot:
+        raise JaxpendError(f"{path} says that it is for the {its_robot}, but its parts are not")
     return controller
+
+
+def load_policy(robot_or_path: str | Path, *, robot: str | None = None) -> Controller:
+    """``load_controller`` of the package's own classes: a ``Policy``, or a ``Guarded`` around it.
+
+    "acrobot" and "pendubot" are the policies that ship with the package. Raises ``JaxpendError``
+    as ``load_controller``.
+    """
+    return load_controller(robot_or_path, robot=robot)

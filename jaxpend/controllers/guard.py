@@ -25,11 +25,10 @@ import numpy as np
 from ..controller import Controller
 from ..designs import competition
 from ..errors import JaxpendError
-from ..plant import Plant, rk4_step, total_energy
+from ..plant import UPRIGHT, Plant, deviation, rk4_step, total_energy
 from ..pytree import pytree, static
 from .energy import energy_shaping
 from .hybrid import with_lqr
-from .lqr import deviation
 from .search_space import FACTOR
 
 __all__ = ["Guarded", "Observer", "Rescue", "guard", "observer"]
@@ -103,7 +102,7 @@ class Rescue:
 
     def failed(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """Whether a state (4,) at time t is one that a swing-up that worked does not reach."""
-        upright = jnp.array([jnp.pi, 0.0, 0.0, 0.0], x.dtype)
+        upright = jnp.array(UPRIGHT, x.dtype)
         away = jnp.max(jnp.abs(deviation(x, upright)[:2])) > self.radius
         failed = (t > self.after) & away
         if self.excess is None:

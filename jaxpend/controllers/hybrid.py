@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from ..controller import Controller
-from ..plant import Plant
+from ..plant import Plant, deviation
 from ..pytree import pytree
-from .lqr import LQR, deviation, lqr
+from .lqr import LQR, lqr
 from .search_space import FACTOR
 
 __all__ = ["Ellipsoid", "Hybrid", "Tolerances", "ellipsoid", "ellipsoid_of_torque", "with_lqr"]

@@ -15,25 +15,15 @@ import numpy as np
 from ..controller import Memoryless
 from ..designs import active_joint
 from ..errors import JaxpendError
-from ..plant import Plant, linearize
+from ..plant import UPRIGHT, Plant, deviation, linearize
 from ..pytree import pytree
 from .search_space import FACTOR
 
-__all__ = ["LQR", "delay_tolerant", "deviation", "lqr"]
+__all__ = ["DEFAULT_Q", "DEFAULT_R", "LQR", "delay_tolerant", "growth", "lqr"]
 
 # Bryson's rule: 1 / (largest acceptable value)^2 of rad, rad, rad/s, rad/s.
 DEFAULT_Q = (1.0, 1.0, 0.1, 0.1)
 DEFAULT_R = 1.0
-
-
-UPRIGHT = (np.pi, 0.0, 0.0, 0.0)
-
-
-def deviation(x: jax.Array, goal: jax.Array) -> jax.Array:
-    """``x - goal``, (4,), with the angles wrapped to [-pi, pi)."""
-    turn = 2 * jnp.pi
-    angle = jnp.remainder(x[:2] - goal[:2] + jnp.pi, turn) - jnp.pi
-    return jnp.concatenate([angle, x[2:] - goal[2:]])
 
 
 @pytree

@@ -19,12 +19,12 @@ import numpy as np
 
 from ..designs import active_joint
 from ..errors import JaxpendError
-from ..plant import Plant
+from ..plant import Plant, deviation
 from ..pytree import pytree, static
 from ..trajopt.ilqr import Problem, Solution, iterate, solve, warm_start
 from ..trajopt.reference import Reference
 from ..trajopt.swingup import step
-from .lqr import DEFAULT_Q, deviation, lqr
+from .lqr import DEFAULT_Q, lqr
 from .search_space import FACTOR
 from .tvlqr import along
 

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 
 from ..controller import Memoryless
 from ..designs import active_joint
-from ..plant import Plant
+from ..plant import Plant, deviation
 from ..pytree import pytree
-from .lqr import deviation
 from .search_space import FACTOR
 
 __all__ = ["PD", "pd"]

@@ -11,10 +11,10 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from ..plant import Plant
+from ..plant import Plant, deviation
 from ..pytree import pytree
 from ..trajopt.reference import Reference
-from .lqr import DEFAULT_Q, DEFAULT_R, LQR, deviation, lqr
+from .lqr import DEFAULT_Q, DEFAULT_R, LQR, lqr
 from .search_space import OVER_TIME
 
 __all__ = ["Riccati", "riccati"]

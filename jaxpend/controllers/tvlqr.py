@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..controller import Memoryless
-from ..plant import Plant, rk4_step
+from ..plant import Plant, deviation, rk4_step
 from ..pytree import pytree
 from ..trajopt.reference import Reference
-from .lqr import DEFAULT_Q, DEFAULT_R, LQR, delay_tolerant, deviation, lqr
+from .lqr import DEFAULT_Q, DEFAULT_R, LQR, delay_tolerant, lqr
 from .search_space import OVER_TIME
 
 __all__ = ["TVLQR", "along", "tvlqr"]

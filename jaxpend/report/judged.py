@@ -8,8 +8,7 @@ import jax
 import numpy as np
 
 from ..boards import HEADINGS, Board
-from ..controllers.files import load_controller
-from ..controllers.policy import read_header
+from ..controllers.files import load_controller, read_header
 from ..plant import forward_kinematics
 from ..robustness import benchmark
 from ..runs.reader import RunRecord

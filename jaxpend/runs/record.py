@@ -109,7 +109,7 @@ def find(run: Path) -> list[Found]:
     Raises:
         JaxpendError: it is none of these, or cannot be read.
     """
-    from ..controllers.policy import read_header
+    from ..controllers.files import read_header
     from ..robots import ROBOTS
 
     if seeds := seed_folders(run):

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import designs
+from ..boards import v2
 from ..config import GradientRun, Run, SACRun, SNESRun, TrainRun
 from ..controller import Controller
 from ..controllers.catalogue import find_controller
@@ -237,8 +237,8 @@ def train(config: Run, command: str = "jaxpend.train.train") -> dict:
     if isinstance(
         config, GradientRun | SNESRun
     ):  # before the folder is made: a wrong file leaves nothing behind
-        plant = designs.competition(config.robot)
-        start = find_controller(config.policy, config.controller, plant, config.robot)
+        task = v2(config.robot).task
+        start = find_controller(config.policy, config.controller, task)
     stages = stages_of(config, start)
     vmap = config.vmap == "yes" or (config.vmap == "auto" and jax.default_backend() != "cpu")
     with contextlib.ExitStack() as opened:

@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 
 from .. import gradient, sac, snes
+from ..boards import v2
 from ..config import GradientConfig, GuardConfig, SACConfig, SNESConfig
 from ..controller import Controller
 from ..controllers.guard import guard
 from ..controllers.search_space import kinds
-from ..designs import competition
 from ..score import imperfect, nominal, score_v2
 
 __all__ = ["SAC", "SNES", "Gradient", "Imitation", "Stage"]
@@ -29,7 +29,7 @@ VALIDATION_SEED = 2**31 - 1
 def _validation(controller: Controller, robot: str, count: int) -> jax.Array:
     """Mean v2 score over random imperfect scenarios, always the same."""
     key = jax.random.key(VALIDATION_SEED)
-    return score_v2(imperfect(controller, competition(robot), key, count)).mean()
+    return score_v2(imperfect(controller, v2(robot).task, key, count)).mean()
 
 
 def value(
@@ -173,7 +173,7 @@ class SAC(Stage):
 
     def judge(self, state, metrics):
         policy = sac.greedy_policy(self.config, state)
-        c = nominal(policy, policy.robot)
+        c = nominal(policy, v2(policy.robot).task)
         score = float(score_v2(c))
         row = {"updates": int(state.updates), "score": score, "uptime": c.uptime, **metrics}
         return row, [(policy, score)]
@@ -216,14 +216,14 @@ class Gradient(Stage):
     def advance(self, states):
         count, after = min(self.config.chunk, self.total - self.done(states[0])), []
         for state in states:
-            arguments = self.config, state["start"], state["search"], count, self.robot
+            arguments = self.config, state["start"], state["search"], count, v2(self.robot).task
             search, metrics = gradient.improve(*arguments)
             after.append((state | {"search": search, "done": state["done"] + count}, metrics))
         return after
 
     def judge(self, state, metrics):
         policy = gradient.current(self.config, state["start"], state["search"])
-        score = float(score_v2(nominal(policy, self.robot)))
+        score = float(score_v2(nominal(policy, v2(self.robot).task)))
         worth = value(self.config, policy, score, self.robot)
         row = {"score": score, "value": worth, "lost": int(state["search"].lost)}
         return row | {name: values[-1] for name, values in metrics.items()}, [(policy, worth)]
@@ -259,10 +259,10 @@ class SNES(Stage):
         shapes = jax.eval_shape(lambda p: p, policy)
         self.policy = self.guarded(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes))
         kinds(self.policy, config.searched)
-        self.fresh_fitness = jax.jit(lambda p, key: snes.fitness(config, p, key, robot)[0])
+        self.fresh_fitness = jax.jit(lambda p, key: snes.fitness(config, p, key, v2(robot).task)[0])
 
         def evolve_all(policies, searches, count):
-            one = lambda p, s: snes.evolve(config, p, s, count, robot)  # noqa: E731
+            one = lambda p, s: snes.evolve(config, p, s, count, v2(robot).task)  # noqa: E731
             return jax.vmap(one)(policies, searches)
 
         self.evolve_all = jax.jit(evolve_all, static_argnames="count")
@@ -293,7 +293,7 @@ class SNES(Stage):
 
         both = [(state["start"], state["search"]) for state in states]
         if len(states) == 1:
-            after = [snes.evolve(self.config, *both[0], count, self.robot)]
+            after = [snes.evolve(self.config, *both[0], count, v2(self.robot).task)]
         else:
             stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *both)
             found = self.evolve_all(*stacked, count)
@@ -311,7 +311,7 @@ class SNES(Stage):
         found = {"mean": snes.mean_controller, "individual": snes.best_controller}
         for name, policy_of in found.items():
             policy = policy_of(self.config, start, search)
-            score = float(score_v2(nominal(policy, self.robot)))
+            score = float(score_v2(nominal(policy, v2(self.robot).task)))
             worth = value(self.config, policy, score, self.robot)
             row |= {f"{name}_score": score, f"{name}_value": worth}
             row[f"{name}_fresh_fitness"] = self.fresh_fitness(policy, key)

@@ -9,23 +9,27 @@
    a closed loop (TVLQR) picks the winner.
 """
 
+import dataclasses
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import designs
+from ..boards import Board, Task
 from ..config import Search
 from ..controllers.lqr import lqr
 from ..controllers.tvlqr import tvlqr
+from ..errors import JaxpendError
 from ..score import official
 from . import ilqr, swingup
 from .reference import Reference
 
 __all__ = ["Search", "find"]
 
-FINE_DT, COARSE_DT = 0.002, 0.01
+COARSE_DT = 0.01  # s
 # (final weight, m line width, W power width) of each stage.
 SHORT_STAGES = ((1.0, 0.2, 0.5), (10.0, 0.1, 0.3), (100.0, 0.1, 0.3))
 LONG_STAGES = (
@@ -38,21 +42,21 @@ SHORT_ITERATIONS, LONG_ITERATIONS, FINE_ITERATIONS = 60, 100, 40
 SAME = 1e-4
 
 
-def _parameters(plant, robot, goal, dt, weight, line_width, power_width):
+def _parameters(task, goal, dt, weight, line_width, power_width):
     """The problem's parameters; the final cost has the shape of the LQR's cost-to-go."""
-    top = lqr(plant, robot, dt=None)
+    top = lqr(task.plant, task.robot, dt=None)
     final = (
         jnp.zeros((5, 5)).at[:4, :4].set(top.cost_to_go / top.cost_to_go[0, 0]).at[4, 4].set(0.1)
     )
     return swingup.SwingUp(
-        plant, jnp.append(goal, 0.0), weight * final, line_width, power_width,
-        joint=designs.active_joint(robot), dt=dt,
+        task.plant, jnp.append(goal, 0.0), weight * final, line_width, power_width,
+        task=task, dt=dt,
     )  # fmt: skip
 
 
-def _stages(plant, robot, dt, stages, iterations, goal, u, mu=1.0):
+def _stages(task, dt, stages, iterations, goal, u, mu=1.0):
     """All stages in turn on a batch of starts: goal (B, 4), u (B, N)."""
-    base = _parameters(plant, robot, goal[0], dt, 1.0, 0.1, 0.1)
+    base = _parameters(task, goal[0], dt, 1.0, 0.1, 0.1)
 
     @jax.jit
     @partial(jax.vmap, in_axes=(0, 0, None))
@@ -64,7 +68,7 @@ def _stages(plant, robot, dt, stages, iterations, goal, u, mu=1.0):
             line_width=line_width,
             power_width=power_width,
         )
-        limit = plant.torque_limit[p.joint]
+        limit = p.plant.torque_limit[p.joint]
         return ilqr.solve(
             swingup.problem(), p, jnp.zeros(5), u, limit, iterations=iterations, mu=mu
         )
@@ -98,12 +102,12 @@ def _distinct(cost: np.ndarray, limit: int | None = None, same: float = SAME) ->
     return kept[:limit]
 
 
-@partial(jax.jit, static_argnames=("dt", "steps", "joint"))
+@partial(jax.jit, static_argnames=("dt", "steps", "task"))
 @partial(jax.vmap, in_axes=(0, 0, None, None, None, None, None))
-def _hold(z, goal, gain, plant, dt, steps, joint):
+def _hold(z, goal, gain, plant, dt, steps, task):
     """States (M, 5) and torques (M,) of LQR from ``z`` (5,)."""
-    p = swingup.SwingUp(plant, None, None, None, None, joint=joint, dt=dt)
-    limit = plant.torque_limit[joint]
+    p = swingup.SwingUp(plant, None, None, None, None, task=task, dt=dt)
+    limit = plant.torque_limit[p.joint]
 
     def step(z, _):
         u = jnp.clip(-gain @ (z[:4] - goal), -limit, limit)
@@ -113,35 +117,36 @@ def _hold(z, goal, gain, plant, dt, steps, joint):
     return jax.lax.scan(step, z, length=steps)[1]
 
 
-@partial(jax.jit, static_argnames=("ratio", "joint"))
+@partial(jax.jit, static_argnames=("ratio", "task"))
 @partial(jax.vmap, in_axes=(0, None, None, None))
-def _refine(coarse, plant, ratio, joint):
+def _refine(coarse, plant, ratio, task):
     """The coarse torques as a ramp on the fine grid (N * ratio,), kept on course by the gains."""
-    p = swingup.SwingUp(plant, None, None, None, None, joint=joint, dt=FINE_DT)
+    p = swingup.SwingUp(plant, None, None, None, None, task=task, dt=task.dt)
+    limit = plant.torque_limit[p.joint]
     n = coarse.u.shape[0]
 
     def step(z, k):
         i, part = k // ratio, (k % ratio) / ratio
-        between = lambda v, j: (1 - part) * v[i] + part * v[j]  # noqa: E731
         # Torques held over a coarse step are right in its middle.
         u = jnp.interp(k + 0.5, ratio * (jnp.arange(n) + 0.5), coarse.u)
-        u = u + coarse.gain[i, :4] @ (z[:4] - between(coarse.z, i + 1)[:4])
-        u = jnp.clip(u, -plant.torque_limit[joint], plant.torque_limit[joint])
+        expected = (1 - part) * coarse.z[i] + part * coarse.z[i + 1]
+        u = u + coarse.gain[i, :4] @ (z[:4] - expected[:4])
+        u = jnp.clip(u, -limit, limit)
         return swingup.step(p, z, u), u
 
     return jax.lax.scan(step, coarse.z[0], jnp.arange(n * ratio))[1]
 
 
-def _coarse(plant, robot, search: Search, say):
+def _coarse(task, search: Search, say):
     """Goals, turn-by-turn statistics and solutions of steps 1 and 2."""
-    joint = designs.active_joint(robot)
-    gain = lqr(plant, robot, dt=COARSE_DT).gain[joint]
+    plant = task.plant
+    gain = lqr(plant, task.robot, dt=COARSE_DT).gain[task.joint]
     goals, torques, labels = [], [], []
     for number, horizon in enumerate(search.horizons):
         goal, u = _random_starts(search, horizon, number)
-        found = _stages(plant, robot, COARSE_DT, SHORT_STAGES, SHORT_ITERATIONS, goal, u)
+        found = _stages(task, COARSE_DT, SHORT_STAGES, SHORT_ITERATIONS, goal, u)
         rest = round((search.horizon - horizon) / COARSE_DT)
-        _, held = _hold(found.z[:, -1], goal, gain, plant, COARSE_DT, rest, joint)
+        _, held = _hold(found.z[:, -1], goal, gain, plant, COARSE_DT, rest, task)
         keep = np.array(_distinct(np.asarray(found.cost)), int)
         say(f"horizon {horizon} s: {len(keep)} distinct optima of {search.starts} starts")
         goals.append(goal[keep])
@@ -149,38 +154,44 @@ def _coarse(plant, robot, search: Search, say):
         cost = np.asarray(found.cost)
         labels += [(horizon, int(np.sum(np.abs(cost - cost[i]) <= SAME))) for i in keep]
     goal, u = jnp.concatenate(goals), jnp.concatenate(torques)
-    return goal, labels, _stages(plant, robot, COARSE_DT, LONG_STAGES, LONG_ITERATIONS, goal, u)
+    return goal, labels, _stages(task, COARSE_DT, LONG_STAGES, LONG_ITERATIONS, goal, u)
 
 
-def find(robot: str, config: Search = Search(), *, say=lambda line: None):
+def find(
+    task: Task, config: Search = Search(), *, say: Callable[[str], None] = lambda line: None
+) -> list[tuple[Reference, dict[str, Any]]]:
     """The optimum trajectories found, best official score first: a list of (Reference, report).
 
-    Needs ``jax.enable_x64``. Raises ``JaxpendError`` for an unknown robot or a torque limit that
-    is not positive.
+    The torque limit is ``config.torque_limit``, not the task's. Needs ``jax.enable_x64``. Raises
+    ``JaxpendError`` for a torque limit that is not positive, or if no start came to an optimum.
     """
-    plant, joint = designs.competition(robot, config.torque_limit), designs.active_joint(robot)
-    goal, labels, coarse = _coarse(plant, robot, config, say)
+    judged_on = Board("found", task)
+    task = dataclasses.replace(task, torque_limit=config.torque_limit)
+    plant = task.plant
+    goal, labels, coarse = _coarse(task, config, say)
     best = np.array(_distinct(np.asarray(coarse.cost), config.keep, same=3 * SAME), int)
+    if not best.size:
+        raise JaxpendError("no start came to an optimum; give more starts or torque")
     goal, coarse = goal[best], jax.tree.map(lambda v: v[best], coarse)
     # The regularisation may have grown at an optimum; gains to follow it with are those without.
-    coarse = _stages(plant, robot, COARSE_DT, LONG_STAGES[-1:], 1, goal, coarse.u, mu=0.01)
+    coarse = _stages(task, COARSE_DT, LONG_STAGES[-1:], 1, goal, coarse.u, mu=0.01)
     say("refining: " + ", ".join(f"{1 - c:.4f}" for c in np.asarray(coarse.cost)))
-    u = _refine(coarse, plant, round(COARSE_DT / FINE_DT), joint)
-    fine = _stages(plant, robot, FINE_DT, FINE_STAGES, FINE_ITERATIONS, goal, u)
-    fine = _stages(plant, robot, FINE_DT, FINE_STAGES[-1:], 1, goal, fine.u, mu=1e-8)
-    gain = lqr(plant, robot, dt=FINE_DT).gain[joint]
-    hold = round(config.hold / FINE_DT)
-    z, held = _hold(fine.z[:, -1], goal, gain, plant, FINE_DT, hold, joint)
-    found = []
+    u = _refine(coarse, plant, round(COARSE_DT / task.dt), task)
+    fine = _stages(task, task.dt, FINE_STAGES, FINE_ITERATIONS, goal, u)
+    fine = _stages(task, task.dt, FINE_STAGES[-1:], 1, goal, fine.u, mu=1e-8)
+    gain = lqr(plant, task.robot, dt=task.dt).gain[task.joint]
+    hold = round(config.hold / task.dt)
+    z, held = _hold(fine.z[:, -1], goal, gain, plant, task.dt, hold, task)
+    found: list[tuple[Reference, dict[str, Any]]] = []
     for i, label in enumerate(best):
         reference = Reference(
             x=jnp.concatenate([fine.z[i, :, :4], z[i, :, :4]]),
             u=jnp.concatenate([fine.u[i], held[i]]),
             gain=jnp.concatenate([fine.gain[i], jnp.tile(jnp.append(-gain, 0.0), (hold, 1))]),
-            robot=robot,
-            dt=FINE_DT,
+            robot=task.robot,
+            dt=task.dt,
         )
-        measured = official(tvlqr(plant, reference), robot)
+        measured = official(tvlqr(plant, reference), judged_on)
         horizon, hits = labels[label]
         turns = round(float(goal[i, 1]) / (2 * np.pi))
         report = {"score": measured["score"], "turns_of_theta2": turns, "first_horizon": horizon,
