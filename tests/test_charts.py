@@ -96,3 +96,20 @@ def test_a_page_recolours_charts_and_keeps_their_ids_apart():
     ids = [{part.split('"')[0] for part in text.split('id="')[1:]} for text in (first, second)]
     assert ids[0]
     assert not ids[0] & ids[1]
+
+
+def test_criteria_and_grids_of_ones_own_are_drawn():
+    grids = {
+        "delay": {"variation": "delay", "values": [0.0, 0.1], "success": [1.0, 0.0]},
+        "delay (2)": {"variation": "delay", "values": [0.2, 0.3], "success": [0.5, 0.0]},
+    }
+    over = {"overall": [0.25, 0.5, 0.5], "scores": {"mine": [0.25, 0.5, 0.5]}}
+    result = {"robot": "acrobot", "overall": 0.5, "scores": {"mine": 0.5}, "over_keys": over}
+    bars, strips, _ = plots.robustness_figure(
+        [result | {"criteria": {"mine": {"grids": grids}}}]
+    ).axes
+    assert [text.get_text() for text in bars.get_yticklabels()] == ["Overall", "mine"]
+    assert [bar.get_width() for bar in bars.patches] == [0.5, 0.5]
+    whiskers = [sorted(line.get_xdata()) for line in bars.lines]
+    assert whiskers == [[0.25, 0.5], [0.25, 0.5]]
+    assert len(strips.images) == 2

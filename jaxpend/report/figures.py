@@ -12,21 +12,19 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from ..boards import CRITERIA
 from ..files import to_json, write_atomically
-from ..robustness import CRITERIA
 from ..variations import VARIATIONS
 
 __all__ = [
     "PALETTE",
     "map_figure",
-    "medians",
     "panel",
     "robustness_figure",
     "save",
@@ -116,21 +114,14 @@ def stack(
 # --- robustness ----------------------------------------------------------------------------
 
 
-def medians(result: dict[str, Any]) -> tuple[float, dict[str, float]]:
-    """The overall robustness and that of every criterion: medians over the keys of a result."""
-    over = result["over_keys"]
-    scores = {n: median(over["scores"].get(n, [score])) for n, score in result["scores"].items()}
-    return median(over["overall"]), scores
-
-
 def _bars(axes, result: dict[str, Any], first: bool) -> None:
     """The six scores and the overall one: medians over keys, with the range as whiskers."""
-    over, names = result["over_keys"], list(reversed(CRITERIA))
-    overall, scores = medians(result)
-    titles = ["Overall", *(CRITERIA[name] for name in names)]
-    values = [overall, *(scores[name] for name in names)]
+    over, scores = result["over_keys"], result["scores"]
+    names = list(reversed(scores))
+    titles = ["Overall", *(CRITERIA.get(name, name) for name in names)]
+    values = [result["overall"], *(scores[name] for name in names)]
     ranges = [over["overall"], *(over["scores"].get(n, [scores[n]]) for n in names)]
-    colours = [PALETTE["ink"]] + [PALETTE["one"]] * len(CRITERIA)
+    colours = [PALETTE["ink"]] + [PALETTE["one"]] * len(names)
     axes.barh(range(len(values)), values, color=colours, height=0.7)
     for y, (value, spread) in enumerate(zip(values, ranges, strict=True)):
         if len(spread) > 1:
@@ -151,14 +142,14 @@ def _bars(axes, result: dict[str, Any], first: bool) -> None:
 
 
 def _strips(axes, result: dict[str, Any], first: bool, margin: float = 0.18) -> Any:
-    """One row a grid: every value coloured by the fraction of its runs that succeed.
+    """One row a grid: every value coloured by the fraction of the first key's runs that succeed.
 
     ``margin`` is the room for the ends of a grid, in widths of a row.
     """
     rows = [
-        (name, grid)
-        for criterion in CRITERIA
-        for name, grid in result["criteria"][criterion]["grids"].items()
+        (grid.get("variation", name), grid)
+        for criterion in result["criteria"].values()
+        for name, grid in criterion["grids"].items()
     ]
     for y, (name, grid) in enumerate(rows):
         success, values = np.array(grid["success"]), grid["values"]
@@ -254,7 +245,7 @@ def _table(result: dict[str, Any]) -> str:
         for name, grid in found["grids"].items():
             columns = [grid["values"], grid["success"], *([grid["performance"]] if scored else [])]
             for value, *numbers in zip(*columns, strict=True):
-                unit = VARIATIONS[name].unit
+                unit = VARIATIONS[grid.get("variation", name)].unit
                 writer.writerow([result["robot"], criterion, name, unit, value, *numbers])
     return text.getvalue()
 

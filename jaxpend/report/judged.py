@@ -10,10 +10,9 @@ import numpy as np
 from ..boards import HEADINGS, Board
 from ..controllers.files import load_controller, read_header
 from ..plant import forward_kinematics
-from ..robustness import benchmark
+from ..robustness import KEYS, benchmark
 from ..runs.reader import RunRecord
 from ..score import nominal_run
-from .figures import medians
 
 __all__ = ["Judged", "criteria_costs", "judge"]
 
@@ -40,7 +39,7 @@ class Judged:
     @property
     def robustness(self) -> float | None:
         """Overall robustness, the median over keys; None where it was not measured."""
-        return medians(self.report)[0] if self.report else None
+        return self.report["overall"] if self.report else None
 
     @property
     def whole(self) -> float:
@@ -55,7 +54,7 @@ class Judged:
         return min(self.whole, max(3.0, float(round(2.5 * self.up))))
 
 
-def judge(run: RunRecord, board: Board, keys: int = 3) -> Judged | None:
+def judge(run: RunRecord, board: Board, keys: int = KEYS) -> Judged | None:
     """The official run of a run's best policy so far, its score, and its robustness.
 
     The policies of several seeds share one compilation.
@@ -75,7 +74,7 @@ def judge(run: RunRecord, board: Board, keys: int = 3) -> Judged | None:
     report = None
     if keys:
         policy = load_controller(run.policy, robot=run.robot)
-        found = benchmark(policy, task.plant, jax.random.key(0), keys=keys)
+        found = benchmark(policy, board, jax.random.key(0), keys=keys)
         report = {"robot": run.robot} | found.as_dict()
     x = np.asarray(trajectory.x)
     samples = np.isfinite(x).all(axis=1).cumprod().sum()  # the first one is the start

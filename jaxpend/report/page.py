@@ -12,9 +12,9 @@ import jinja2
 import numpy as np
 
 from .. import __version__, boards
-from ..boards import Board
+from ..boards import CRITERIA, Board
 from ..files import write_atomically
-from ..robustness import CRITERIA
+from ..robustness import KEYS
 from ..runs.reader import RunRecord, StageRecord, remarks
 from ..runs.statistics import interquartile_mean, interval
 from . import figures
@@ -199,7 +199,7 @@ def write(
     *,
     title: str,
     robustness: bool = True,
-    keys: int = 3,
+    keys: int = KEYS,
     board: Board | None = None,
 ) -> Path:
     """Judge what the runs have left, and write ``report.html`` and the pictures of ``report/``.
@@ -279,7 +279,7 @@ def _best(runs, judged, rows, shown: int, board: Board, title: str) -> dict[str,
     own = [(run.name, best.score, best.robustness)]
     if len(runs) > 1:  # the best of several is no fair row alone
         own.append((f"mean of {title}", scores["mean"], robust and robust["mean"]))
-    six = figures.medians(best.report)[1] if best.report else {}
+    six = best.report["scores"] if best.report else {}
     return {
         "best": best,
         "shown": run.name,
@@ -289,7 +289,7 @@ def _best(runs, judged, rows, shown: int, board: Board, title: str) -> dict[str,
         "scores": scores,
         "robust": robust,
         "criteria": criteria_costs(best, board),
-        "six": {CRITERIA[name]: share for name, share in six.items()},
+        "six": {CRITERIA.get(name, name): share for name, share in six.items()},
         "ranking": _ranking(board, own),
         "film": _film(runs, judged, shown, board),
     }
