@@ -1,7 +1,8 @@
 """The controller protocol, what checks it, and the simplest controllers on it."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import lru_cache
 from typing import Any, Protocol
 
 import jax
@@ -67,7 +68,7 @@ def check_form(controller: Any) -> None:
 def check_controller(controller: Any) -> None:
     """Refuse what would end in a traceback of jax later; the check at every door but ``rollout``.
 
-    A controller with a method ``check`` is asked too.
+    A controller with a method ``check`` is asked too. Controllers of one form are called once.
 
     Raises:
         JaxpendError: as ``check_form``; an array with NaN in it; it raises when it is called; or
@@ -75,18 +76,40 @@ def check_controller(controller: Any) -> None:
     """
     check_form(controller)
     name = type(controller).__name__
-    try:
-        hash(jax.tree.structure(controller))
-    except TypeError as error:
-        raise JaxpendError(f"{name} has a static field that cannot be hashed: {error}") from None
-    for leaf in jax.tree.leaves(controller):
+    leaves, structure = jax.tree.flatten(controller)
+    for leaf in leaves:
         if isinstance(leaf, jax.core.Tracer | jax.ShapeDtypeStruct):
             continue
         if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) and np.isnan(leaf).any():
             raise JaxpendError(f"{name} holds a number that is NaN; all of them must be numbers")
-
     if hasattr(controller, "check"):
         controller.check()
+    for path, value in _static_fields(controller):
+        try:
+            hash(value)
+        except TypeError:
+            what = type(value).__name__
+            text = f"{name} has a {what} in its static field {path}; what is static is hashable"
+            raise JaxpendError(text) from None
+    forms = tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+    _check_call(structure, forms, jax.config.jax_enable_x64)
+
+
+def _static_fields(part: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Names and values of what jax takes for constant in a dataclass and in its parts."""
+    for field in dataclasses.fields(part) if dataclasses.is_dataclass(part) else ():
+        value = getattr(part, field.name)
+        if field.metadata.get("static"):
+            yield path + field.name, value
+        else:
+            yield from _static_fields(value, f"{path}{field.name}.")
+
+
+@lru_cache(maxsize=64)
+def _check_call(structure: Any, forms: tuple[tuple[Any, Any], ...], _x64: bool) -> None:
+    """What ``check_controller`` says of a call, of controllers of one form."""
+    controller = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*form) for form in forms])
+    name = type(controller).__name__
 
     def first_call(controller: Any) -> Any:
         carry = controller.reset(jax.random.key(0))
@@ -96,7 +119,7 @@ def check_controller(controller: Any) -> None:
         carry, returned = jax.eval_shape(first_call, controller)
     except JaxpendError:
         raise
-    except Exception as error:
+    except Exception as error:  # the controller is the user's, and may raise anything
         raise JaxpendError(f"{name} cannot be called: {blame(error)}") from error
     if not (isinstance(returned, tuple) and len(returned) == 2):
         raise JaxpendError(f"{name} returns {type(returned).__name__}, not (carry, torque)")
@@ -104,11 +127,11 @@ def check_controller(controller: Any) -> None:
     if getattr(torque, "shape", None) != (2,):
         shape = getattr(torque, "shape", type(torque).__name__)
         raise JaxpendError(f"{name} returns a torque of shape {shape}; it must be (2,)")
-    forms = [
+    memories = [
         (jax.tree.structure(tree), [leaf.shape for leaf in jax.tree.leaves(tree)])
         for tree in (carry, after)
     ]
-    if forms[0] != forms[1]:
+    if memories[0] != memories[1]:
         raise JaxpendError(f"{name} returns a memory of another form than that of its reset")
 
 

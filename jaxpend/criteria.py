@@ -66,6 +66,11 @@ class Criteria:
     number_of_swingups: jax.Array  # rises above the line more than 1 s apart
     success: jax.Array  # bool, above the line at the end
 
+    @property
+    def diverged(self) -> jax.Array:
+        """Whether the trajectory holds what is not a number; its score is that of a failure."""
+        return ~jnp.isfinite(self.velocity_cost)
+
 
 def _swingup_index(up: jax.Array) -> jax.Array:
     """Index of the swing-up: the reference looks at samples 1 to N - 2 only, from the end."""
@@ -101,7 +106,7 @@ def criteria(
     """The leaderboard's criteria of one trajectory or a batch of them.
 
     Args:
-        t: (..., N) or (..., N + 1) time stamps, s.
+        t: (..., N) or (..., N + 1) time stamps, s; an array or lists of numbers, like all three.
         x: (..., N, 4) or (..., N + 1, 4) states. The official path stores as many states as
             torques, so a last state beyond them is dropped here too.
         u: (..., N, 2) applied torques, N m.
@@ -112,8 +117,12 @@ def criteria(
     Raises:
         JaxpendError: shapes that do not fit together or fewer than three samples.
     """
+    try:
+        t, x, u = (jnp.asarray(values) for values in (t, x, u))
+    except (TypeError, ValueError) as error:
+        raise JaxpendError(f"criteria need arrays of numbers for t, x and u: {error}") from None
     n = u.shape[-2] if u.ndim > 1 else 0
-    fits = t.shape[-1] == x.shape[-2] and t.shape[-1] in (n, n + 1)
+    fits = t.ndim > 0 and x.ndim > 1 and t.shape[-1] == x.shape[-2] and t.shape[-1] in (n, n + 1)
     if n < 3 or not fits or x.shape[-1] != 4 or u.shape[-1] != 2:
         raise JaxpendError(
             f"criteria need t (..., N or N+1), x (..., N or N+1, 4), u (..., N, 2) with N > 2; "

@@ -115,6 +115,7 @@ def official(controller: Controller, judged_on: Board | str) -> dict[str, Any]:
             "robot": task.robot,
             "score": float(task.score(c)),
             "success": bool(c.success),
+            "diverged": bool(c.diverged),
             "criteria": {name: float(getattr(c, name)) for name in names},
         }
 

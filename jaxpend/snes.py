@@ -65,14 +65,13 @@ def fitness(
     draws = policies and config.action_noise
     keys = jax.random.split(key_noise, config.rollouts if draws else 1)
     c = jax.vmap(lambda k: performance(noisy, plant, k, task))(keys)
-    # A diverged rollout has score 0 already; its velocity says that it diverged.
-    score, diverged = task.score(c).mean(), jnp.sum(~jnp.isfinite(c.velocity_cost))
+    score, diverged = task.score(c).mean(), jnp.sum(c.diverged)
     if not config.scenarios:
         return score, diverged
     c = imperfect(controller, task, key_scenarios, config.scenarios)
     weight = config.scenario_weight
     score = (1 - weight) * score + weight * task.score(c).mean()
-    return score, diverged + jnp.sum(~jnp.isfinite(c.velocity_cost))
+    return score, diverged + jnp.sum(c.diverged)
 
 
 class _Search:

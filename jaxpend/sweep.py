@@ -137,6 +137,7 @@ def compile_sweep(
     scenarios: Scenario, controller: Controller, key: jax.Array, **options: Any
 ) -> None:
     """Compile what ``sweep`` with the same arguments runs; ``options`` are all of its options."""
+    check_controller(controller)
     pieces, static = _plan(scenarios, key, **options)
     first, keys = next(pieces)
     _run.lower(first, controller, keys, **static).compile()

@@ -71,3 +71,12 @@ def test_all_but_a_share_are_nominal():
     wrong = [off(jax.tree.map(np.asarray, some(share))).any(axis=0) for share in (0.0, 0.3)]
     assert not wrong[0].any()
     np.testing.assert_allclose(wrong[1].mean(), 0.3, atol=0.1)
+
+
+def test_a_plant_without_coulomb_friction_gets_some():
+    plant = PLANT.replace(coulomb_friction=None)
+    drawn = jax.jit(jax.vmap(lambda key: sample(plant, key)))(
+        jax.random.split(jax.random.key(0), 99)
+    )
+    assert drawn.plant.coulomb_friction.shape == (99, 2)
+    assert np.abs(drawn.plant.coulomb_friction).max() > 0.01

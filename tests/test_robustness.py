@@ -337,3 +337,58 @@ def test_command_judges_a_python_function_by_name(tmp_path, monkeypatch):
     assert isinstance(law, PythonLaw)
     _, torque = law(None, 0.0, jnp.zeros(4))
     np.testing.assert_array_equal(torque, [1.0, 0.0])
+
+
+def test_delays_do_not_overwrite_each_other_or_the_scenarios_own():
+    base = Scenario(competition("pendubot"))
+    for changes in ({"delay": [0.02], "velocity_delay": [0.01]},
+                    {"velocity_delay": [0.01], "delay": [0.02]}):  # fmt: skip
+        np.testing.assert_array_equal(vary(base, changes, key=KEY).delay, [[10, 10, 10, 10]])
+    changes = {"velocity_delay": [0.02], "delay": [0.01]}
+    np.testing.assert_array_equal(vary(base, changes, key=KEY).delay, [[5, 5, 10, 10]])
+    own = base.replace(delay=np.array([3, 3, 3, 3], "i4"))
+    varied = vary(own, {"velocity_delay": [0.0, 0.02]}, key=KEY)
+    np.testing.assert_array_equal(varied.delay, [[3, 3, 3, 3], [3, 3, 10, 10]])
+
+
+def test_grids_of_ones_own():
+    """Other criteria, two strips of one variation, and a plant that has no Coulomb friction."""
+    plant = NEAR_UPRIGHT.plant.replace(coulomb_friction=None)
+    grids = [
+        Strip("mass", "m2", np.array([0.6, 2.5])),
+        Strip("mass", "m2", np.array([0.61])),
+        Strip("rubbing", "cf1", np.array([0.0, 0.01])),
+        Strip("shaking", "process_noise", np.array([0.0, 9.0]), 3),
+    ]
+    near = NEAR_UPRIGHT.replace(plant=plant)
+    found = benchmark(BALANCE, near, KEY, grids=grids, keys=2, duration=SHORT)
+    assert list(found.scores) == ["mass", "rubbing", "shaking"]
+    assert list(found.success) == ["m2", "m2 (2)", "cf1", "process_noise"]
+    assert (found.success["m2"].tolist(), found.success["m2 (2)"].tolist()) == ([1, 0], [1])
+    assert found.scores["mass"] == pytest.approx(2 / 3)
+    assert list(found.scores_by_key) == ["shaking"]
+    assert found.scores["shaking"] == 0.5
+    grid = found.as_dict()["criteria"]["mass"]["grids"]["m2 (2)"]
+    assert (grid["variation"], grid["values"]) == ("m2", [0.61])
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: benchmark(BALANCE, NEAR_UPRIGHT, KEY, grids=[]), "grids is empty"),
+        (
+            lambda: benchmark(BALANCE, NEAR_UPRIGHT, KEY, grids=[Strip("a", "m3", np.ones(1))]),
+            "unknown variation 'm3'; known: Ir",
+        ),
+        (lambda: survey(NEAR_UPRIGHT, BALANCE, {}, KEY), "the grid is empty"),
+        (lambda: survey(NEAR_UPRIGHT, BALANCE, {"m2": []}, KEY), "m2 has values of shape (0,)"),
+        (lambda: survey(NEAR_UPRIGHT, BALANCE, {"m2": "heavy"}, KEY), "m2 is 'heavy'; it must be"),
+        (lambda: survey(NEAR_UPRIGHT, BALANCE, {"m3": [1]}, KEY), "unknown variation 'm3'"),
+        (lambda: mildest_failure(NEAR_UPRIGHT, BALANCE, {}, KEY), "there are no ranges"),
+        (lambda: vary(NEAR_UPRIGHT, {}, key=KEY), "there are no changes"),
+        (lambda: vary(NEAR_UPRIGHT, {"m2": [[1.0]]}, key=KEY), "m2 has values of shape (1, 1)"),
+    ],
+)
+def test_senseless_grids_are_one_sentence(call, words):
+    with refused(words):
+        call()

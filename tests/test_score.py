@@ -10,9 +10,18 @@ import pytest
 from conftest import assert_close, both_precisions, both_robots, excerpt, task_of
 
 from jaxpend import JaxpendError
-from jaxpend.controllers import Zero
+from jaxpend.controllers import Feedback, Zero
 from jaxpend.designs import competition
-from jaxpend.score import V1_DEFAULT, V2_HARDWARE, criteria, imperfect, score_v1, score_v2, score_v3
+from jaxpend.score import (
+    V1_DEFAULT,
+    V2_HARDWARE,
+    criteria,
+    imperfect,
+    official,
+    score_v1,
+    score_v2,
+    score_v3,
+)
 
 SCORES = {
     "score_v1_default": lambda c: score_v1(c, V1_DEFAULT),
@@ -154,3 +163,19 @@ def test_judging_loads_no_training_library(module):
     loaded = set(done.stdout.split())
     assert "jaxpend" in loaded
     assert not loaded & heavy
+
+
+def test_lists_are_arrays_and_what_is_no_number_is_refused():
+    t, x, u = held_up()
+    expected = criteria(t, x, u, competition("acrobot"))
+    found = criteria(t.tolist(), x.tolist(), u.tolist(), competition("acrobot"))
+    np.testing.assert_allclose(found.velocity_cost, expected.velocity_cost, rtol=1e-5)
+    with pytest.raises(JaxpendError, match="criteria need arrays of numbers"):
+        criteria(["now"], x, u, competition("acrobot"))
+
+
+def test_a_run_that_diverges_is_said_to():
+    spinning = Feedback(lambda t, x: jnp.where(t > 0.1, jnp.nan, 0.0) * x[:2])
+    judged = official(spinning, "acrobot")
+    assert (judged["diverged"], judged["success"], judged["score"]) == (True, False, 0.0)
+    assert not official(Zero(), "acrobot")["diverged"]

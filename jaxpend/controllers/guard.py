@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..controller import Controller
+from ..controller import Controller, check_controller, check_robot
 from ..designs import competition
 from ..errors import JaxpendError
 from ..plant import UPRIGHT, Plant, deviation, rk4_step, total_energy
@@ -168,8 +168,11 @@ def guard(
         excess: J; with more than that above the energy of upright it has failed at any time.
 
     Raises:
-        JaxpendError: an unknown robot, or a value out of range.
+        JaxpendError: an unknown robot, no controller or one of the other robot, or a value out
+            of range.
     """
+    check_controller(main)
+    check_robot(main, robot)
     plant = jax.tree.map(jnp.asarray, competition(robot) if plant is None else plant)
     if not (after > 0 and radius > 0 and excess > 0):
         raise JaxpendError(

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from ..controller import Controller
+from ..controller import Controller, check_controller
 from ..plant import Plant, deviation
 from ..pytree import pytree
 from .lqr import LQR, lqr
@@ -98,5 +98,6 @@ def with_lqr(
 
     ``fraction`` and ``hysteresis`` are those of ``ellipsoid_of_torque``.
     """
+    check_controller(swingup)
     top = lqr(plant, robot)
     return Hybrid(swingup, top, ellipsoid_of_torque(top, fraction, hysteresis=hysteresis))
