@@ -17,13 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxpend import Scenario, designs, sac, snes
+from jaxpend.boards import v2
 from jaxpend.config import TrainRun
 from jaxpend.controllers import Policy
 from jaxpend.controllers.catalogue import build
 from jaxpend.observation import Observation
 from jaxpend.runs.folder import load_config
+from jaxpend.sac.stage import SAC
 from jaxpend.score import performance, score_v2
-from jaxpend.train.stages import SAC, SNES
+from jaxpend.snes import SNES
 
 
 def random_policy(width: int) -> Policy:
@@ -61,8 +63,9 @@ def bench_seeds(count: int = 4) -> None:
     # Imitation is not timed: a few demonstrations will do.
     shown = dataclasses.replace(recipe.sac.demonstrations, episodes=20, updates=1)
     config = dataclasses.replace(recipe.sac, demonstrations=shown, eval_every=3200)
-    search = SNES(dataclasses.replace(recipe.snes, chunk=2), random_policy(64), recipe.robot)
-    training = SAC(config)
+    task = v2(recipe.robot).task
+    search = SNES(dataclasses.replace(recipe.snes, chunk=2), random_policy(64), task)
+    training = SAC(config, task)
     keys = [jax.random.key(seed) for seed in range(count)]
     parts = {
         "SAC": (training, [sac.init(config, key) for key in keys]),

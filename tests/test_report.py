@@ -22,7 +22,7 @@ from jaxpend.controllers.policy import network_in
 from jaxpend.pytree import pytree
 from jaxpend.report import page
 from jaxpend.runs import reader as report
-from jaxpend.runs.folder import changed, to_mapping
+from jaxpend.runs.folder import RunFolder, changed, to_mapping
 from jaxpend.score import official
 from jaxpend.train.loop import stages_of
 
@@ -217,6 +217,15 @@ def test_what_went_wrong_is_said(tmp_path):
     assert run.made_by["command"] == "jaxpend train --seed 5"
 
 
+def test_a_run_folder_says_what_differs_from_the_defaults(tmp_path):
+    config = TrainRun(robot="acrobot", seed=7, sac=SACConfig(steps=12))
+    with RunFolder(tmp_path / "run", config, "jaxpend train"):
+        pass
+    (run,) = report.find(tmp_path / "run")
+    default = to_mapping(SACConfig())["steps"]
+    assert run.made_by["changed"] == {"seed": [7, 0], "sac.steps": [12, default]}
+
+
 def test_rows_that_came_twice_count_once_in_order(tmp_path):
     rows = [sac(50, 0.1), sac(25, 0.2), sac(50, 0.3), {"stage": "else"}, ["no row"]]
     folder = make_run(tmp_path / "resumed", rows)
@@ -247,6 +256,22 @@ def test_policies_can_be_shown_without_a_run(tmp_path, monkeypatch):
         (
             lambda folder: make_run(folder, []).joinpath("config.json").write_text("[]"),
             "is not the",
+        ),
+        (
+            lambda folder: make_run(folder, []).joinpath("run.json").write_text('{"stages": [3]}'),
+            "run.json is not what a run says of itself; the run cannot be read",
+        ),
+        (
+            lambda folder: (
+                make_run(folder, [])
+                .joinpath("run.json")
+                .write_text('{"stages": [], "changed": {"seed": 3}}')
+            ),
+            "run.json is not what a run says of itself; the run cannot be read",
+        ),
+        (
+            lambda folder: make_run(folder, []).joinpath("result.json").write_text('{"score": ""}'),
+            "result.json is not the result of a run; the run cannot be read",
         ),
         (lambda folder: make_run(folder, []).joinpath("policy.npz").write_bytes(b""), "cut off"),
         (lambda folder: folder.write_text("text"), "is not a policy file"),
@@ -333,13 +358,17 @@ def test_a_run_on_a_plant_of_its_own_is_not_beside_the_published(tmp_path):
 
 
 def test_a_run_of_version_0_1_has_a_page(tmp_path):
-    folder = make_run(tmp_path / "old", [sac(0, 0.1), sac(25_000, 0.4)], seed=4242)
-    (folder / "run.json").write_text(json.dumps(MADE_BY))
+    """Its run.json says nothing of its stages."""
+    rows = [sac(0, 0.1), sac(25, 0.4, temperature=0.1)]
+    rows += [{"stage": "snes", "generation": 9, "mean_score": 0.35, **SNES}]
+    folder = make_run(tmp_path / "old", rows)
+    (folder / "run.json").write_text('{"version": "0.1.0", "command": "jaxpend train --seed 3"}')
     (run,) = report.find(folder)
-    text = page.write([run], folder, title="old", robustness=False).read_text()
-    assert text.count("v2 score") >= 1
-    assert "learning0" in text
-    assert cells(text, "after SAC")[1] == "0.5000"
+    assert page._curve(run, run.stages[0], "best")[1].tolist() == [0.1, 0.4]
+    commands.report(folder, robustness=False)
+    text = (folder / "report.html").read_text()
+    for words in ("jaxpend train --seed 3", "SAC: temperature", "SNES: mean fitness", "after SAC"):
+        assert words in text
 
 
 def test_the_users_matplotlib_stays_as_it_is(tmp_path):

@@ -82,7 +82,7 @@ def report(run: Path, /, out: Path | None = None, robustness: bool = True) -> No
             runs/NAME.
         robustness: run the robustness benchmark too, seconds for every seed.
     """
-    from ..runs.record import find, remarks
+    from ..runs.reader import find, remarks
     from ..terminal import console
 
     found = find(run)

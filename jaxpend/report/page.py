@@ -182,10 +182,10 @@ def _summary(values: Sequence[float | None]) -> dict[str, float] | None:
 
 def _board(run: RunRecord) -> Board:
     """The v2 board of a run's robot; of a run on a plant of its own, on that, and unpublished."""
-    official = boards.v2(run.robot)
-    if not run.plant or run.plant == dict(official.task.parameters):
+    official, plant = boards.v2(run.robot), run.made_by.get("plant")
+    if not plant or plant == dict(official.task.parameters):
         return official
-    return Board(f"{official.name}, own plant", official.task.of(run.plant))
+    return Board(f"{official.name}, own plant", official.task.of(plant))
 
 
 def _legible(text: str) -> str:
@@ -236,7 +236,8 @@ def write(
             for k, (stage, d) in enumerate(learning)
         ]
     if shown is not None:
-        made_by = made_by or judged[shown].header.get("provenance", {})
+        if "command" not in made_by:
+            made_by = judged[shown].header.get("provenance", {})
         context |= _best(runs, judged, rows, shown, board, title)
         heading = f"{board.robot}, {runs[shown].name}"
         context["charts"] = _draw(judged[shown], board, heading, pictures)
@@ -252,6 +253,7 @@ def write(
 
 def _about(runs: Sequence[RunRecord], rows: list[dict], board: Board, title: str) -> dict[str, Any]:
     """What the page says of the runs, whether there is a policy or not."""
+    changed = runs[0].made_by.get("changed", {})
     return {
         "title": title,
         "robot": board.robot,
@@ -265,7 +267,7 @@ def _about(runs: Sequence[RunRecord], rows: list[dict], board: Board, title: str
         "finished": all(run.result or not run.config for run in runs),
         "seeds": rows if len(runs) > 1 else [],
         "stages": runs[0].results if len(runs) == 1 else {},
-        "config": [{"name": n, "value": v, "default": d} for n, (v, d) in runs[0].changed.items()],
+        "config": [{"name": n, "value": v, "default": d} for n, (v, d) in changed.items()],
         "whole_config": _flat(runs[0].config),
         "versions": {"jaxpend": __version__, "jax": jax.__version__, "numpy": np.__version__},
     }

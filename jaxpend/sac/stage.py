@@ -1,0 +1,143 @@
+"""The stages of ``jaxpend sac``: imitation of demonstrations, and SAC itself."""
+
+from functools import partial
+
+import jax
+
+from ..boards import Task
+from ..config import SACConfig
+from ..controller import Controller
+from ..pytree import pytree
+from ..score import nominal
+from ..stage import Chart, Stage
+from . import algorithm
+from .algorithm import SACState
+from .demonstrations import Imitation as Learner
+
+__all__ = ["SAC", "Imitation", "ImitationState"]
+
+
+@pytree
+class ImitationState:
+    """SAC before its first step, and the actor that imitates."""
+
+    sac: SACState
+    learner: Learner
+
+
+class Imitation(Stage[None, ImitationState, SACState]):
+    """The actor imitates demonstrations."""
+
+    name, title, unit, column = "imitation", "Imitation", "updates", "updates"
+    charts = (Chart("Squared error", {"loss": "loss"}, "of the action", True),)
+    CHUNK = 2000  # updates
+
+    def __init__(self, config: SACConfig):
+        self.config, self.total = config, config.demonstrations.updates
+
+    @classmethod
+    def of(cls, run, start, task):
+        config = getattr(run, "sac", None)
+        return cls(config) if config and config.demonstrations.episodes else None
+
+    def start(self, seed, before):
+        return ImitationState(*algorithm.begin(self.config, jax.random.key(seed)))
+
+    def like(self):
+        return ImitationState(*algorithm.structure(self.config))
+
+    def policy_like(self):
+        return None
+
+    def done(self, state):
+        return int(state.learner.done)
+
+    def advance(self, states):
+        count = min(self.CHUNK, self.total - self.done(states[0]))
+        after = []
+        for state in states:
+            learner, loss = algorithm.imitate_chunk(self.config, state.sac, state.learner, count)
+            after.append((state.replace(learner=learner), {"loss": loss}))
+        return after
+
+    def judge(self, state, metrics):
+        return metrics, []
+
+    def note(self, row):
+        return f"loss {float(row['loss']):.5f}"
+
+    def watched(self, state):
+        return state.learner.params, state.learner.opt_state
+
+    def rekey(self, state, number):
+        key = jax.random.fold_in(state.learner.key, number)
+        return state.replace(learner=state.learner.replace(key=key))
+
+    def outcome(self, state, best):
+        return state.sac.replace(actor=state.learner.params)
+
+
+class SAC(Stage[SACState | None, SACState, Controller]):
+    """SAC on the surrogate reward; judged by the official score."""
+
+    name, title, unit, column = "sac", "SAC", "environment steps", "env_steps"
+    heading, scores = "after SAC", ("score",)
+    charts = (
+        Chart("Official score", {"best so far": "best", "now": "score"}, "v2 score"),
+        Chart("Reward", {"reward": "reward"}, "mean of a step"),
+        Chart("Temperature", {"temperature": "temperature"}, log=True),
+        Chart("Entropy of the policy", {"entropy": "entropy"}, "nats"),
+        Chart("Loss of the critics", {"loss": "critic_loss"}, log=True),
+        Chart("Loss of the actor", {"loss": "actor_loss"}),
+    )
+    ties = True  # they happen before the first success: the later policy has learned more
+
+    def __init__(self, config: SACConfig, task: Task):
+        self.config, self.task, self.total = config, task, config.steps
+        self.vector_steps = max(config.eval_every // config.num_envs, 1)
+
+    @classmethod
+    def of(cls, run, start, task):
+        config = getattr(run, "sac", None)
+        return cls(config, task) if config else None
+
+    def start(self, seed, before):
+        if before is not None:
+            return before
+        return algorithm.begin(self.config, jax.random.key(seed))[0]
+
+    def like(self):
+        return algorithm.structure(self.config)[0]
+
+    def policy_like(self):
+        return jax.eval_shape(partial(algorithm.greedy_policy, self.config), self.like())
+
+    def done(self, state):
+        return int(state.env_steps)
+
+    def advance(self, states):
+        # The last chunk is as long as what is left, in whole steps of all environments.
+        left = -(-(self.total - self.done(states[0])) // self.config.num_envs)
+        steps = min(self.vector_steps, left)
+        if len(states) == 1:
+            return [algorithm.train_chunk(self.config, states[0], steps)]
+        return algorithm.train_chunks(self.config, states, steps)
+
+    def judge(self, state, metrics):
+        policy = algorithm.greedy_policy(self.config, state)
+        c = nominal(policy, self.task)
+        score = float(self.task.score(c))
+        row = {"updates": int(state.updates), "score": score, "uptime": c.uptime, **metrics}
+        return row, [(policy, score)]
+
+    def note(self, row):
+        return f"reward {float(row['reward']):.2f}  score {row['score']:.3f}"
+
+    def watched(self, state):
+        return state.replace(demonstrations=None)
+
+    def rekey(self, state, number):
+        return state.replace(key=jax.random.fold_in(state.key, number))
+
+    def outcome(self, state, best):
+        return best
