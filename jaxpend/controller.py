@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .errors import JaxpendError, blame
-from .pytree import pytree, static
+from .pytree import Pytree, pytree, static
 from .robots import ROBOTS
 
 __all__ = [
@@ -92,7 +92,7 @@ def check_controller(controller: Any) -> None:
             text = f"{name} has a {what} in its static field {path}; what is static is hashable"
             raise JaxpendError(text) from None
     forms = tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-    _check_call(structure, forms, jax.config.jax_enable_x64)
+    _check_call(structure, forms, jnp.result_type(float))
 
 
 def _static_fields(part: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -106,7 +106,7 @@ def _static_fields(part: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 @lru_cache(maxsize=64)
-def _check_call(structure: Any, forms: tuple[tuple[Any, Any], ...], _x64: bool) -> None:
+def _check_call(structure: Any, forms: tuple[tuple[Any, Any], ...], _precision: Any) -> None:
     """What ``check_controller`` says of a call, of controllers of one form."""
     controller = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*form) for form in forms])
     name = type(controller).__name__
@@ -153,7 +153,7 @@ def check_robot(controller: Any, robot: str) -> None:
         raise JaxpendError(f"this controller is for the {its}, not for the {robot}")
 
 
-class Memoryless:
+class Memoryless(Pytree):
     """A controller whose torque depends on time and state alone."""
 
     def reset(self, key: jax.Array) -> None:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from .errors import JaxpendError
 from .plant import Plant, tip_height
-from .pytree import pytree
+from .pytree import Pytree, pytree
 
 __all__ = [
     "EPSILON",
@@ -52,7 +52,7 @@ V2_HARDWARE = V2_OFFICIAL | {"tau_cost": 100.0, "tau_smoothness": 4.0}
 
 
 @pytree
-class Criteria:
+class Criteria(Pytree):
     """What the leaderboards measure; every field has the batch shape of the trajectories."""
 
     swingup_time: jax.Array  # s, start of the time above the line that lasts to the end

@@ -31,7 +31,7 @@ from .controller import Controller, check_controller
 from .controllers.search_space import coordinates, kinds
 from .criteria import EPSILON
 from .plant import rk4_step
-from .pytree import pytree
+from .pytree import Pytree, pytree
 from .rollout import rollout
 from .scenario import Scenario
 from .stage import Chart, SearchStage, SearchState
@@ -42,7 +42,7 @@ __all__ = ["Gradient", "GradientConfig", "GradientState", "current", "improve", 
 
 
 @pytree
-class GradientState:
+class GradientState(Pytree):
     """Everything that the ascent changes."""
 
     parameters: jax.Array  # (parameters,)

@@ -6,6 +6,7 @@ benchmark in float32, as ``jaxpend robustness`` runs it.
 
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -159,7 +160,7 @@ def _ships_policy(robot: str) -> bool:
     return True
 
 
-def chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[str, tuple]:
+def chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[str, tuple[str, Make]]:
     """Name -> (title, make) of what the command line asks for."""
     if controllers is None:
         names = [n for n in CATALOGUE if not n.startswith("policy") or _ships_policy(robot)]
@@ -167,16 +168,17 @@ def chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[str
         names = [name.strip() for name in controllers.split(",") if name.strip()]
         if not names:
             raise JaxpendError(f"there is no controller to judge; known: {', '.join(CATALOGUE)}")
-    chosen = {
+    chosen: dict[str, tuple[str, Make]] = {
         name: (
             CATALOGUE[choose("controller", name, CATALOGUE)].title,
-            lambda plant, name=name: build(name, plant, robot),
+            partial(build, name, robot=robot),
         )
         for name in names
     }
     if policy is not None:
         load_controller(policy, robot=robot)  # a wrong file is known at once
-        chosen["own_policy"] = (policy.stem, lambda plant: load_controller(policy, robot=robot))
+        own = partial(load_controller, policy, robot=robot)
+        chosen["own_policy"] = (policy.stem, lambda plant: own())
     return chosen
 
 

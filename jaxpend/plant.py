@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .pytree import pytree
+from .pytree import Pytree, pytree
 
 __all__ = [
     "UPRIGHT",
@@ -45,7 +45,7 @@ COULOMB_STEEPNESS = 100.0
 
 
 @pytree
-class Plant:
+class Plant(Pytree):
     """Physical parameters of a double pendulum, SI units. Index 0 is link/joint 1."""
 
     mass: jax.Array  # (2,) kg
@@ -128,7 +128,7 @@ def _is_frictionless(plant: Plant) -> bool:
 def friction_vector(plant: Plant, x: jax.Array) -> jax.Array:
     """Friction torque ``F(omega) = b omega + c arctan(100 omega)``, shape (2,), N m."""
     viscous = plant.damping * x[2:4]
-    if _is_frictionless(plant):
+    if plant.coulomb_friction is None or _is_frictionless(plant):
         return viscous
     return viscous + plant.coulomb_friction * _arctan(COULOMB_STEEPNESS * x[2:4])
 

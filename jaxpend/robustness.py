@@ -12,10 +12,11 @@ import concurrent.futures
 import dataclasses
 import statistics
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .boards import CRITERIA, Board, Strip, board, strips
@@ -106,7 +107,7 @@ def _base(nominal: Scenario, strips: Iterable[Strip]) -> Scenario:
     cost a run is little beside what six programs cost to compile.
     """
 
-    def full(value: float, *shape: int) -> np.ndarray:
+    def full(value: float, *shape: int) -> Any:
         return np.full(shape, value, nominal.dtype)
 
     neutral = {
@@ -160,7 +161,7 @@ def _split(grids: Mapping[str, Strip], values: np.ndarray) -> dict[str, np.ndarr
 
 def _compile(jobs: list[tuple], options: dict[str, Any]) -> float:
     """Compile all jobs, two at a time; seconds."""
-    start, x64 = time.perf_counter(), jax.config.jax_enable_x64
+    start, x64 = time.perf_counter(), jnp.result_type(float) == jnp.float64
 
     def one(job):
         with jax.enable_x64(x64):  # the setting belongs to a thread
@@ -219,14 +220,14 @@ def benchmark(
     """
     if keys < 1:
         raise JaxpendError(f"keys is {keys}; it must be at least 1")
-    trials = strips
+    trials: Callable[[Plant], list[Strip]] = strips
     if isinstance(judged_on, Board | str):
         official = board(judged_on)
         check_robot(controller, official.robot)
         judged_on, trials = official.task.plant, official.trials
     nominal = Scenario(judged_on) if isinstance(judged_on, Plant) else judged_on
     named = _named(trials(nominal.plant) if grids is None else grids)
-    options = {"scored": scored, "dt": dt, "duration": duration, "chunk": chunk}
+    options: dict[str, Any] = {"scored": scored, "dt": dt, "duration": duration, "chunk": chunk}
     rows = {
         draws: {n: s for n, s in named.items() if VARIATIONS[s.variation].draws == draws}
         for draws in (False, True)
@@ -248,7 +249,7 @@ def _report(named, rows, outcomes, keys, **seconds) -> Report:
     """Put together the outcomes, which go by (draws something, number of the key)."""
 
     def of_key(number: int, field: str) -> dict[str, np.ndarray]:
-        found = {}
+        found: dict[str, np.ndarray] = {}
         for draws, its in rows.items():
             if its:
                 outcome = outcomes[draws, number if draws else 0]

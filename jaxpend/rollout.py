@@ -13,7 +13,7 @@ import numpy as np
 from .controller import Controller, check_form
 from .errors import JaxpendError
 from .plant import Plant, rk4_step
-from .pytree import pytree
+from .pytree import Pytree, pytree
 from .scenario import DT, DURATION, Scenario
 
 __all__ = [
@@ -35,7 +35,7 @@ NOISE = {
 
 
 @pytree
-class Trajectory:
+class Trajectory(Pytree):
     """One closed-loop run of N steps. A leading batch axis comes from ``jax.vmap``."""
 
     t: jax.Array  # (N + 1,) s

@@ -10,7 +10,7 @@ import numpy as np
 
 from .errors import JaxpendError, choose
 from .plant import Plant
-from .pytree import pytree
+from .pytree import Pytree, pytree
 
 __all__ = ["DT", "DURATION", "Pulses", "Scenario", "check_values", "delay_steps", "random_pulses"]
 
@@ -20,7 +20,7 @@ DURATION = 10.0
 
 
 @pytree
-class Pulses:
+class Pulses(Pytree):
     """Gaussian torque pulses ``A exp(-(t - mu)^2 / (2 sigma^2))``, n on each joint."""
 
     time: jax.Array  # (2, n) s, centre mu
@@ -34,7 +34,7 @@ class Pulses:
 
 
 @pytree
-class Scenario:
+class Scenario(Pytree):
     """What a controller is put into. Only ``plant`` is required; the rest defaults to nominal."""
 
     plant: Plant

@@ -25,7 +25,7 @@ from .controller import Controller, check_controller
 from .controllers.guard import guard
 from .controllers.policy import change_policies
 from .controllers.search_space import coordinates, kinds
-from .pytree import pytree
+from .pytree import Pytree, pytree
 from .score import imperfect, performance
 from .stage import Chart, SearchStage, SearchState
 
@@ -44,7 +44,7 @@ STRATEGIES = {name: getattr(algorithms, kind) for name, kind in config.STRATEGIE
 
 
 @pytree
-class SNESState:
+class SNESState(Pytree):
     """Everything that the search changes."""
 
     strategy: Any  # evosax state: mean and std, in units of ``_Search``, generation counter

@@ -17,7 +17,7 @@ from .controller import Controller, check_controller
 from .criteria import EPSILON, criteria, score_v2, upright
 from .errors import JaxpendError, choose
 from .plant import Plant
-from .pytree import pytree
+from .pytree import Pytree, pytree
 from .rollout import final_state, rollout
 from .scenario import DT, DURATION, Scenario, check_values
 from .variations import VARIATIONS, vary
@@ -35,7 +35,7 @@ __all__ = [
 
 
 @pytree
-class Outcome:
+class Outcome(Pytree):
     """What became of n rollouts."""
 
     x: jax.Array  # (n, 4) final state
@@ -160,6 +160,10 @@ class Survey:
     score: np.ndarray | None  # mean v2 score of the repetitions
 
 
+def _numpy(values: Any) -> Any:
+    return None if values is None else np.asarray(values)
+
+
 def survey(
     scenario: Scenario | Plant,
     controller: Controller,
@@ -195,11 +199,11 @@ def survey(
     draw_key, run_key = jax.random.split(key)
     outcome = _varied(scenario, controller, changes, draw_key, run_key, options)
     shape = points[0].shape
-    score = outcome.score
+    success, diverged, score = map(_numpy, (outcome.success, outcome.diverged, outcome.score))
     return Survey(
         values=values,
-        success=outcome.success.reshape(shape).mean(axis=-1),
-        diverged=outcome.diverged.reshape(shape).sum(axis=-1),
+        success=success.reshape(shape).mean(axis=-1),
+        diverged=diverged.reshape(shape).sum(axis=-1),
         score=None if score is None else score.reshape(shape).mean(axis=-1),
     )
 

@@ -239,17 +239,17 @@ def sample(plant: Plant, key: jax.Array, share: float = 1.0) -> Scenario:
     kind = jnp.where(jax.random.uniform(key_share) < share, kind, -1)
     which = jnp.where(kind == 0, jax.random.randint(key_which, (), 0, 10), -1)
     amount = jax.random.uniform(key_amount, minval=-1.0, maxval=1.0)
-    share = (amount + 1) / 2  # the same draw on [0, 1]
+    part = (amount + 1) / 2  # the same draw on [0, 1]
     slow, fast = RANGES["responsiveness"]
     pulses: Pulses = random_pulses(key_pulses)
-    delay = jnp.where(kind == 4, jnp.round(share * LONGEST_DELAY), 0).astype(jnp.int32)
-    noise = jnp.where(kind == 1, RANGES["velocity_noise"][1] * share, 0.0)
-    torque_noise = jnp.where(kind == 2, RANGES["torque_noise"][1] * share, 0.0)
+    delay = jnp.where(kind == 4, jnp.round(part * LONGEST_DELAY), 0).astype(jnp.int32)
+    noise = jnp.where(kind == 1, RANGES["velocity_noise"][1] * part, 0.0)
+    torque_noise = jnp.where(kind == 2, RANGES["torque_noise"][1] * part, 0.0)
     return Scenario(
         _vary_plant(plant, which, amount),
         measurement_noise=noise * jnp.array([0.0, 0.0, 1.0, 1.0]),
         torque_noise=torque_noise * (plant.torque_limit > 0),
-        responsiveness=jnp.where(kind == 3, slow + (fast - slow) * share, 1.0),
+        responsiveness=jnp.where(kind == 3, slow + (fast - slow) * part, 1.0),
         delay=jnp.full(4, delay),
         pulses=pulses.replace(amplitude=jnp.where(kind == 5, pulses.amplitude, 0.0)),
     )

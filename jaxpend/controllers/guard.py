@@ -26,7 +26,7 @@ from ..controller import Controller, check_controller, check_robot
 from ..designs import competition
 from ..errors import JaxpendError
 from ..plant import UPRIGHT, Plant, deviation, rk4_step, total_energy
-from ..pytree import pytree, static
+from ..pytree import Pytree, pytree, static
 from .energy import energy_shaping
 from .hybrid import with_lqr
 from .search_space import FACTOR
@@ -45,7 +45,7 @@ SURPLUS = {"acrobot": None, "pendubot": 0.7}
 
 
 @pytree
-class Observer:
+class Observer(Pytree):
     """Estimates the state from measured angles; its memory is (started, x, d, torque)."""
 
     plant: Plant  # the model; its torque limit clips what was asked for
@@ -90,7 +90,7 @@ def observer(plant: Plant, bandwidth: float, *, dt: float = 0.002) -> Observer:
 
 
 @pytree
-class Rescue:
+class Rescue(Pytree):
     """When the main controller counts as failed, and who takes over."""
 
     SEARCHED: ClassVar = {"after": FACTOR, "radius": FACTOR, "excess": FACTOR}
@@ -105,14 +105,14 @@ class Rescue:
         upright = jnp.array(UPRIGHT, x.dtype)
         away = jnp.max(jnp.abs(deviation(x, upright)[:2])) > self.radius
         failed = (t > self.after) & away
-        if self.excess is None:
+        if self.excess is None or self.plant is None:
             return failed
         surplus = total_energy(self.plant, x) - total_energy(self.plant, upright)
         return failed | (surplus > self.excess)
 
 
 @pytree
-class Guarded:
+class Guarded(Pytree):
     """``main`` behind an observer, before a rescue; either may be None."""
 
     main: Any
@@ -183,8 +183,8 @@ def guard(
     if rescue:
         pumping = energy_shaping(plant, robot, surplus=SURPLUS[robot])
         swingup = with_lqr(pumping, plant, robot, **REGION[robot])
-        limits = map(jnp.asarray, (after, radius, excess))
-        rescuing = Rescue(swingup, *limits, plant)
+        limits = [jnp.asarray(limit) for limit in (after, radius, excess)]
+        rescuing = Rescue(swingup, limits[0], limits[1], limits[2], plant)
     if seeing is None and rescuing is None:
         return main
     return Guarded(main, seeing, rescuing)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from ..controller import Controller, check_controller
 from ..plant import Plant, deviation
-from ..pytree import pytree
+from ..pytree import Pytree, pytree
 from .lqr import LQR, lqr
 from .search_space import FACTOR
 
@@ -15,7 +15,7 @@ __all__ = ["Ellipsoid", "Hybrid", "Tolerances", "ellipsoid", "ellipsoid_of_torqu
 
 
 @pytree
-class Ellipsoid:
+class Ellipsoid(Pytree):
     """Entered where ``e' P e <= inner``, left where it exceeds ``outer``."""
 
     SEARCHED: ClassVar = {"inner": FACTOR, "outer": FACTOR}
@@ -31,7 +31,7 @@ class Ellipsoid:
 
 
 @pytree
-class Tolerances:
+class Tolerances(Pytree):
     """Entered where ``|e| <= inner`` in every component, left where one exceeds ``outer``."""
 
     SEARCHED: ClassVar = {"inner": FACTOR, "outer": FACTOR}
@@ -64,7 +64,7 @@ def ellipsoid_of_torque(top: LQR, fraction: float = 1.0, *, hysteresis: float = 
 
 
 @pytree
-class Hybrid:
+class Hybrid(Pytree):
     """``swingup`` outside the region, ``top`` inside it. Both keep their own memory."""
 
     swingup: Any

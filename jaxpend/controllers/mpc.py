@@ -20,7 +20,7 @@ import numpy as np
 from ..designs import active_joint
 from ..errors import JaxpendError
 from ..plant import Plant, deviation
-from ..pytree import pytree, static
+from ..pytree import Pytree, pytree, static
 from ..trajopt.ilqr import Problem, Solution, iterate, solve, warm_start
 from ..trajopt.reference import Reference
 from ..trajopt.swingup import step
@@ -36,7 +36,7 @@ GRID = 0.02
 
 
 @pytree
-class _Window:
+class _Window(Pytree):
     """The problem of one horizon: ``params`` of the ``ilqr.Problem``."""
 
     plant: Plant
@@ -66,7 +66,7 @@ PROBLEM = Problem(step=step, features=_features, final=_final, outer=lambda p, s
 
 
 @pytree
-class MPC:
+class MPC(Pytree):
     """iLQR over a receding horizon of H steps. Its memory is the plan."""
 
     SEARCHED: ClassVar = {"q": FACTOR, "r": FACTOR, "smoothness": FACTOR}

@@ -12,7 +12,7 @@ from .. import config
 from ..designs import active_joint
 from ..errors import JaxpendError
 from ..observation import Observation
-from ..pytree import pytree, static
+from ..pytree import Pytree, pytree, static
 from .search_space import WEIGHT
 
 __all__ = ["ACTIVATIONS", "Memory", "Policy", "change_policies", "network_in", "policies_in"]
@@ -25,7 +25,7 @@ FASTEST = 0.001  # s, the shortest time between calls at which a history still g
 
 
 @pytree
-class Memory:
+class Memory(Pytree):
     """The calls of a policy so far, the newest first; as many as its history may need."""
 
     x: jax.Array  # (N, 4) measured states
@@ -58,7 +58,7 @@ class Memory:
 
 
 @pytree
-class Policy:
+class Policy(Pytree):
     """Multi-layer perceptron from an observation of the state to the driven joint's torque.
 
     With ``observation.history`` it sees past states and actions too, as far apart as in training

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from ..plant import Plant, deviation
-from ..pytree import pytree
+from ..pytree import Pytree, pytree
 from ..trajopt.reference import Reference
 from .lqr import DEFAULT_Q, DEFAULT_R, LQR, lqr
 from .search_space import OVER_TIME
@@ -21,7 +21,7 @@ __all__ = ["Riccati", "riccati"]
 
 
 @pytree
-class Riccati:
+class Riccati(Pytree):
     """Feed-forward and iLQR gains along a trajectory, then the LQR at its end."""
 
     SEARCHED: ClassVar = {"reference.gain": OVER_TIME}

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.tree_util import keystr
 
 from ..errors import JaxpendError
 
@@ -42,8 +43,7 @@ def _declared(part: Any, hidden: bool, prefix: str = "") -> dict[str, str]:
 
 def _named_leaves(controller: Any) -> tuple[dict[str, Any], Any]:
     found, structure = jax.tree_util.tree_flatten_with_path(controller)
-    name = lambda path: jax.tree_util.keystr(path, simple=True, separator=".")  # noqa: E731
-    return {name(path): leaf for path, leaf in found}, structure
+    return {keystr(path, simple=True, separator="."): leaf for path, leaf in found}, structure
 
 
 def _is_under(path: str, name: str) -> bool:
@@ -119,8 +119,8 @@ def coordinates(
 
     places = [place(path, kind) for path, kind in chosen.items()]
     flat, unravel = ravel_pytree(places)
-    weights = [kind == WEIGHT for kind in chosen.values()]
-    weights = np.repeat(weights, [np.size(z) for z in places])
+    is_weight = [kind == WEIGHT for kind in chosen.values()]
+    weights = np.repeat(is_weight, [np.size(z) for z in places])
 
     def rebuild(vector):
         new = dict(zip(chosen, unravel(vector), strict=True))

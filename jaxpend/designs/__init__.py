@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -91,14 +92,14 @@ def from_dict(
         if not torque_limit > 0:
             raise JaxpendError(f"torque limit is {torque_limit} N m; it must be positive")
         limit = np.where(actuation, torque_limit, 0.0)
-    pair = lambda name: np.array([p[name + "1"], p[name + "2"]])  # noqa: E731
-    values = Plant(
-        mass=pair("m"), length=pair("l"), com=pair("r"), inertia=pair("I"), damping=pair("b"),
-        coulomb_friction=pair("cf"), torque_limit=limit, actuation=np.asarray(actuation, float),
-        gravity=np.array(p["g"]), motor_inertia=np.array(p["Ir"]), gear_ratio=np.array(p["gr"]),
-    )  # fmt: skip
+    pairs = {"mass": "m", "length": "l", "com": "r", "inertia": "I", "damping": "b"}
+    pairs |= {"coulomb_friction": "cf"}
+    values: dict[str, Any] = {k: [p[f"{v}1"], p[f"{v}2"]] for k, v in pairs.items()}
+    values |= {"torque_limit": limit, "actuation": actuation, "gravity": p["g"]}
+    values |= {"motor_inertia": p["Ir"], "gear_ratio": p["gr"]}
     # numpy, not jax, arrays: made inside a jitted function, they are still known constants.
-    return Plant(**{k: np.asarray(v, jnp.result_type(float)) for k, v in vars(values).items()})
+    arrays: Any = {k: np.asarray(v, jnp.result_type(float)) for k, v in values.items()}
+    return Plant(**arrays)
 
 
 def from_file(path: str | Path, **kwargs) -> Plant:

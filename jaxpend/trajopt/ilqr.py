@@ -23,7 +23,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ..pytree import pytree, static
+from ..pytree import Pytree, pytree, static
 
 __all__ = ["STEP_SIZES", "Problem", "Solution", "initial", "iterate", "solve", "warm_start"]
 
@@ -32,7 +32,7 @@ MU_MIN, MU_MAX = 1e-8, 1e10
 
 
 @pytree
-class Problem:
+class Problem(Pytree):
     """What is minimised: functions of arrays and of ``params``, any pytree, first argument."""
 
     step: Callable = static()  # (params, z (n,), u ()) -> z (n,)
@@ -42,7 +42,7 @@ class Problem:
 
 
 @pytree
-class Solution:
+class Solution(Pytree):
     """A trajectory, the feedback around it, and the state of the optimisation."""
 
     z: jax.Array  # (N + 1, n)

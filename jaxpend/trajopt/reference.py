@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import read_arrays, write_arrays
 from ..designs import ROBOTS, active_joint
 from ..errors import JaxpendError, choose
-from ..pytree import pytree, static
+from ..pytree import Pytree, pytree, static
 
 __all__ = ["Reference", "load_reference", "save_reference"]
 
@@ -19,7 +19,7 @@ FORMAT = 1
 
 
 @pytree
-class Reference:
+class Reference(Pytree):
     """A swing-up of N steps from hanging to upright, with the feedback that iLQR found for it."""
 
     x: jax.Array  # (N + 1, 4) states

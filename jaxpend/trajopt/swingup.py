@@ -14,6 +14,7 @@ and the objective is the mean of ``tanh(pi c_i / n_i)`` plus a final cost that l
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ from ..boards import Task
 from ..criteria import ScoreV2
 from ..errors import JaxpendError
 from ..plant import Plant, forward_kinematics, rk4_step
-from ..pytree import pytree, static
+from ..pytree import Pytree, pytree, static
 from .ilqr import Problem
 
 __all__ = ["SwingUp", "problem", "smooth_score", "step", "totals"]
@@ -32,14 +33,14 @@ CRITERIA = ("swingup_time", "energy", "tau_cost", "tau_smoothness", "velocity_co
 
 
 @pytree
-class SwingUp:
+class SwingUp(Pytree):
     """Parameters of the problem; all arrays may carry a batch axis under ``jax.vmap``."""
 
     plant: Plant
-    goal: jax.Array  # (5,) final state and torque; theta2 may be any multiple of a turn
-    final_weight: jax.Array  # (5, 5) of the final cost
-    line_width: jax.Array  # () m, s_y
-    power_width: jax.Array  # () W, s_p
+    goal: Any  # (5,) final state and torque; theta2 may be any multiple of a turn
+    final_weight: Any  # (5, 5) of the final cost; like the goal, not for totals
+    line_width: Any  # () m, s_y
+    power_width: Any  # () W, s_p
     task: Task = static()
     dt: float = static()
 
