@@ -73,7 +73,7 @@ run = jax.jit(rollout)(Scenario(plant), mine, jax.random.key(0))
 print("state after 10 s:", np.round(run.x[-1], 3))
 
 # %% Its score: swing-up time, energy, torques and velocities in one number
-for name, controller in {"mine": mine, "the policy that ships": load_policy("pendubot")}.items():
+for name, controller in {"the policy that ships": load_policy("pendubot"), "mine": mine}.items():
     result = official(controller, board)
     up = result["criteria"]["swingup_time"]
     print(f"{name}: v2 score {result['score']:.4f}, upright after {up:.2f} s")
@@ -116,7 +116,7 @@ search = snes.init(config, mine, jax.random.key(2))
 search, history = snes.evolve(config, mine, search, config.generations, task)
 print("mean fitness, from generation to generation:", np.round(history["mean_fitness"], 3))
 tuned = snes.best_controller(config, mine, search)
-print(f"the score was 0.7004 and is {official(tuned, board)['score']:.4f}")
+print(f"the score was {result['score']:.4f} and is {official(tuned, board)['score']:.4f}")
 
 # %% SAC: a policy learns from the reward alone
 # All that stays the same is in the agent, all that changes in the state. A Python loop over chunks
