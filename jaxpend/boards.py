@@ -7,12 +7,13 @@ judges takes one. So training cannot touch official keys or grids, and another b
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
 from . import designs
+from .controller import robot_of
 from .criteria import HEIGHT, Criteria, ScoreV2, criteria
 from .errors import JaxpendError, choose
 from .plant import Plant
@@ -23,7 +24,18 @@ from .variations import RANGES, sample
 if TYPE_CHECKING:
     from .rollout import Trajectory
 
-__all__ = ["CRITERIA", "HEADINGS", "V2", "Board", "Strip", "Task", "board", "strips", "v2"]
+__all__ = [
+    "CRITERIA",
+    "HEADINGS",
+    "V2",
+    "Board",
+    "Strip",
+    "Task",
+    "board",
+    "own_task",
+    "strips",
+    "v2",
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,6 +193,21 @@ V2 = {
 def v2(robot: str) -> Board:
     """The v2 board of a robot. Raises ``JaxpendError`` for an unknown one."""
     return V2[choose("robot", robot, V2)]
+
+
+def own_task(controller: Any, task: Task | None = None) -> Task:
+    """``task``, or where there is none that of the v2 board of the robot a controller is for.
+
+    Raises:
+        JaxpendError: the controller does not say which robot it is for.
+    """
+    if task is not None:
+        return task
+    robot = robot_of(controller)
+    if robot is None:
+        name = type(controller).__name__
+        raise JaxpendError(f"{name} does not know its robot; give a task, as v2(robot).task")
+    return v2(robot).task
 
 
 def board(robot_or_board: "str | Board") -> Board:

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from .boards import Task
+from .boards import Task, own_task
 from .config import GradientConfig
 from .controller import Controller, check_controller
 from .controllers.search_space import coordinates, kinds
@@ -140,12 +140,18 @@ def init(config: GradientConfig, controller: Controller, key: jax.Array) -> Grad
 
 @partial(jax.jit, static_argnames=("config", "steps", "task"))
 def improve(
-    config: GradientConfig, start: Controller, state: GradientState, steps: int, task: Task
+    config: GradientConfig,
+    start: Controller,
+    state: GradientState,
+    steps: int,
+    task: Task | None = None,
 ) -> tuple[GradientState, dict[str, jax.Array]]:
     """Some Adam steps; returns the state and metrics of each step (steps,).
 
     ``start`` is what ``init`` got: the origin of the coordinates, and all that is not searched.
+    ``task`` may be left out for a controller that knows its robot (``boards.own_task``).
     """
+    task = own_task(start, task)
     optimizer = _adam(config, coordinates(start, config.searched)[1])
 
     def step(state, _):

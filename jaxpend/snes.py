@@ -19,7 +19,7 @@ import optax
 from evosax import algorithms
 
 from . import config
-from .boards import Task
+from .boards import Task, own_task
 from .config import GuardConfig, SNESConfig
 from .controller import Controller, check_controller
 from .controllers.guard import guard
@@ -55,13 +55,15 @@ class SNESState(Pytree):
 
 
 def fitness(
-    config: SNESConfig, controller: Controller, key: jax.Array, task: Task
+    config: SNESConfig, controller: Controller, key: jax.Array, task: Task | None = None
 ) -> tuple[jax.Array, jax.Array]:
     """Fitness of a controller, to be maximised, and how many of its rollouts diverged.
 
     The mean score of the task over noisy nominal rollouts; with ``config.scenarios``, its
-    weighted mean with the mean score over random imperfect scenarios of the task.
+    weighted mean with the mean score over random imperfect scenarios of the task. ``task`` may be
+    left out for a controller that knows its robot (``boards.own_task``).
     """
+    task = own_task(controller, task)
     plant = task.plant
     key_noise, key_scenarios = jax.random.split(key)
     noise = jnp.asarray(config.action_noise, jnp.float32) if config.action_noise else None
@@ -132,12 +134,14 @@ def evolve(
     start: Controller,
     state: SNESState,
     generations: int,
-    task: Task,
+    task: Task | None = None,
 ) -> tuple[SNESState, dict[str, jax.Array]]:
     """Run some generations; returns the state and per-generation metrics (generations,).
 
     ``start`` is what ``init`` got: the origin of the coordinates, and all that is not searched.
+    ``task`` may be left out for a controller that knows its robot (``boards.own_task``).
     """
+    task = own_task(start, task)
     search = _Search(config, start)
     strategy, params = search.strategy, search.params
 

@@ -352,7 +352,7 @@ def test_a_run_on_a_plant_of_its_own_is_not_beside_the_published(tmp_path):
     truth = official(load_policy("pendubot"), Board("own", own))["score"]
     assert f"<dd>{truth:.4f}</dd>" in text
     assert abs(truth - 0.6995) > 1e-4  # the score on the board
-    assert "v2, own plant score" in text
+    assert "<dt>v2 on a plant of its own</dt>" in text
     assert "official v2" not in text
     assert "HistorySAC" not in text
 

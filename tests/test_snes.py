@@ -10,7 +10,7 @@ import pytest
 from conftest import assert_close, refused, shipped_network, task_of
 
 from jaxpend import Policy, designs, snes
-from jaxpend.controllers import load_reference, tvlqr
+from jaxpend.controllers import load_reference, lqr, tvlqr
 from jaxpend.controllers.hybrid import with_lqr
 from jaxpend.score import Criteria, official, performance, score_v2
 from jaxpend.snes import SNESConfig
@@ -276,3 +276,13 @@ def test_a_generation_meets_one_noise_and_improves_the_policy(fit):
 def test_senseless_values_are_one_sentence(values, words):
     with refused(words):
         SNESConfig(**values)
+
+
+def test_the_task_may_be_left_out_where_the_controller_knows_its_robot(toy_fitness):
+    config = SNESConfig(generations=1, population=4)
+    named, _ = evolved(config, TOY, 1)
+    known, _ = snes.evolve(config, TOY, snes.init(config, TOY, KEY), 1)
+    np.testing.assert_array_equal(known.strategy.mean, named.strategy.mean)
+    holding = lqr(designs.competition("pendubot"), "pendubot")
+    with refused("LQR does not know its robot; give a task, as v2(robot).task"):
+        snes.evolve(config, holding, snes.init(config, holding, KEY), 1)

@@ -185,7 +185,8 @@ def _board(run: RunRecord) -> Board:
     official, plant = boards.v2(run.robot), run.made_by.get("plant")
     if not plant or plant == dict(official.task.parameters):
         return official
-    return Board(f"{official.name}, own plant", official.task.of(plant))
+    name = run.config.get("plant") or run.config.get("design") or "a plant of its own"
+    return Board(f"{official.name} on {name}", official.task.of(plant))
 
 
 def _legible(text: str) -> str:
@@ -259,7 +260,7 @@ def _about(runs: Sequence[RunRecord], rows: list[dict], board: Board, title: str
         "robot": board.robot,
         "board": board.name,
         "published": bool(board.published),
-        "score_name": f"{'official ' * bool(board.published)}{board.name} score",
+        "score_name": f"official {board.name} score" if board.published else board.name,
         "height": board.task.height,
         "duration": board.task.duration,
         "rate": round(1 / board.task.dt),
