@@ -175,7 +175,7 @@ def _thousands(value: float, _position: int = 0) -> str:
 
 
 def _calm(axes, least: float = 0.01) -> None:
-    """No axis spans less than this share of its values: noise is not to look like news."""
+    """Make an axis span at least this share of its values, so that noise does not fill it."""
     low, high = axes.get_ylim()
     missing = least * max(abs(low), abs(high)) - (high - low)
     if missing > 0:
