@@ -19,10 +19,10 @@ import numpy as np
 from jaxpend import Scenario, designs, sac, snes
 from jaxpend.boards import v2
 from jaxpend.config import TrainRun
+from jaxpend.config_files import load_config
 from jaxpend.controllers import Policy
 from jaxpend.controllers.catalogue import build
 from jaxpend.observation import Observation
-from jaxpend.runs.folder import load_config
 from jaxpend.sac.stage import SAC
 from jaxpend.score import performance, score_v2
 from jaxpend.snes import SNES

@@ -34,10 +34,10 @@ from jaxpend import designs, leaderboard, load_policy
 from jaxpend.boards import v2
 from jaxpend.cli import emit_json
 from jaxpend.config import STRATEGIES, GradientConfig, SACRun, SNESConfig
+from jaxpend.config_files import load_config
 from jaxpend.controllers import guard
 from jaxpend.files import write_atomically
 from jaxpend.gradient import Gradient
-from jaxpend.runs.folder import load_config
 from jaxpend.snes import SNES
 from jaxpend.sweep import sweep
 from jaxpend.terminal import console

@@ -1,9 +1,10 @@
 """Train and judge controllers for the acrobot and the pendubot, end to end in JAX."""
 
-import importlib
-from typing import TYPE_CHECKING, Any
-
+# Nothing is imported here: until the command line begins, Ctrl-C is a traceback.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from . import rollout
     from .controllers.files import load_policy, save_policy
     from .controllers.policy import Policy
@@ -39,8 +40,10 @@ _HOME = {
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     """Names are imported when they are first asked for: a command's help must not wait for jax."""
+    import importlib
+
     if name == "rollout":  # the module, which can be called
         return importlib.import_module(".rollout", __name__)
     if name not in _HOME:

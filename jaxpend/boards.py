@@ -34,6 +34,7 @@ __all__ = [
     "board",
     "own_task",
     "strips",
+    "task_of",
     "v2",
 ]
 
@@ -213,3 +214,22 @@ def own_task(controller: Any, task: Task | None = None) -> Task:
 def board(robot_or_board: "str | Board") -> Board:
     """A board itself, or by a robot's name its v2 board."""
     return robot_or_board if isinstance(robot_or_board, Board) else v2(robot_or_board)
+
+
+def task_of(robot: str, plant: str | None = "", design: str | None = "") -> Task:
+    """The v2 task of a robot, on another plant where one is named; the torque limit stays 6 N m.
+
+    Args:
+        robot: "acrobot" or "pendubot".
+        plant: file of parameters (``designs.read``); empty or None: none.
+        design: name of an identified set (``designs.parameters``); empty or None: none.
+
+    Raises:
+        JaxpendError: an unknown robot or design, both given, or a file that cannot be used.
+    """
+    task = v2(robot).task
+    if plant and design:
+        raise JaxpendError(f"plant {plant} and design {design} are both given; there is one plant")
+    if plant:
+        return task.of(designs.read(plant))
+    return task.of(designs.parameters(design)) if design else task

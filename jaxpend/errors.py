@@ -1,9 +1,13 @@
 """What the commands turn into one sentence and exit code 2."""
 
+import os
 import traceback
-from pathlib import Path
 
 __all__ = ["JaxpendError", "blame", "choose"]
+
+
+# Where files begin whose lines are not a user's: this package, Python's own modules, frozen ones.
+NOT_THEIRS = (*(os.path.join(os.path.dirname(m), "") for m in (__file__, os.__file__)), "<frozen")
 
 
 class JaxpendError(Exception):
@@ -19,12 +23,11 @@ def choose(what: str, name: object, known) -> str:
 
 def blame(error: BaseException) -> str:
     """What went wrong in a user's own code, in one line, with the file and line of their error."""
-    own = str(Path(__file__).parent)
-    frames = [
-        frame
-        for frame in traceback.extract_tb(error.__traceback__)
-        if "site-packages" not in frame.filename and not frame.filename.startswith((own, "<frozen"))
-    ]
+    at = ""
+    for frame in traceback.extract_tb(error.__traceback__):
+        if "site-packages" not in frame.filename and not frame.filename.startswith(NOT_THEIRS):
+            at = f" at {frame.filename}:{frame.lineno}"
     said = (str(error).strip() or "no message").splitlines()[0]
-    where = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
-    return f"{type(error).__name__}: {said}{where}"
+    if isinstance(error, SyntaxError):  # there is no frame of code that was never run
+        said, at = error.msg, f" at {error.filename}:{error.lineno}"
+    return f"{type(error).__name__}: {said}{at}"

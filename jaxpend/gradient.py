@@ -18,7 +18,7 @@ ones fades from the gradient (``memory``).
 
 import math
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ import numpy as np
 import optax
 
 from .boards import Task, own_task
-from .config import GradientConfig
+from .config import GradientConfig, Run
 from .controller import Controller, check_controller
 from .controllers.search_space import coordinates, kinds
 from .criteria import EPSILON
@@ -190,34 +190,39 @@ class Gradient(SearchStage):
         self.policy, self.task = policy, task
 
     @classmethod
-    def of(cls, run, start, task):
+    def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
         config = getattr(run, "gradient", None)
-        return cls(config, start, task) if config and config.steps else None
+        if not (config and config.steps):
+            return None
+        assert start is not None  # a run of this stage alone names one
+        return cls(config, start, task)
 
-    def start(self, seed, before):
+    def start(self, seed: int, before: Controller) -> SearchState:
         key = jax.random.fold_in(jax.random.key(seed), 2)
         return SearchState(before, init(self.config, before, key), jnp.asarray(0))
 
-    def like(self):
+    def like(self) -> SearchState:
         return jax.eval_shape(lambda policy: self.start(0, policy), self.policy)
 
-    def advance(self, states):
+    def advance(self, states: list[SearchState]) -> list[tuple[SearchState, dict[str, Any]]]:
         count, after = self.chunk(states[0]), []
         for state in states:
             search, metrics = improve(self.config, state.start, state.search, count, self.task)
             after.append((self.moved(state, search, count), metrics))
         return after
 
-    def judge(self, state, metrics):
+    def judge(
+        self, state: SearchState, metrics: dict[str, Any]
+    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
         policy = current(self.config, state.start, state.search)
         score, worth = self.compared(policy)
         row = {"score": score, "value": worth, "lost": int(state.search.lost)}
         return row | {name: values[-1] for name, values in metrics.items()}, [(policy, worth)]
 
-    def note(self, row):
+    def note(self, row: dict[str, Any]) -> str:
         return f"smooth score {float(row['smooth_score']):.4f}  score {row['score']:.4f}"
 
-    def watched(self, state):
+    def watched(self, state: SearchState) -> Any:
         return state.search.parameters
 
 

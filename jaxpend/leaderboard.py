@@ -20,15 +20,10 @@ from .errors import JaxpendError, choose
 from .plant import Plant
 from .robustness import CRITERIA, KEYS, benchmark
 from .score import official
-from .terminal import console
 
-__all__ = ["chosen", "judge", "leaderboard", "markdown", "published", "show"]
+__all__ = ["cells", "chosen", "judge", "leaderboard", "markdown", "published"]
 
 Make = Callable[[Plant], Controller]
-
-# Headings for a terminal, in the order of ``HEADINGS`` and of ``CRITERIA``.
-SHORT = ("up s", "J", "torque²", "steps", "speed²")
-SHORT_ROBUSTNESS = ("model", "vel.", "torque", "resp.", "delay", "pulses")
 
 
 def published(board: Board) -> list[dict[str, Any]]:
@@ -91,8 +86,8 @@ def leaderboard(
     return {"robot": board.robot, "rows": sorted(rows, key=lambda row: -row["score"])}
 
 
-def _cells(row: Mapping[str, Any]) -> list[str]:
-    """A row as text: title, score, criteria, six robustness scores, robustness."""
+def cells(row: Mapping[str, Any]) -> list[str]:
+    """A row of a board as text: title, score, criteria, six robustness scores, robustness."""
 
     def shown(value: float | None, form: str) -> str:
         return "" if value is None else format(value, form)
@@ -126,30 +121,9 @@ def markdown(board: Mapping[str, Any]) -> str:
     headings = _headings()
     lines = [headings, ["---"] + ["---:"] * (len(headings) - 1)]
     for row in board["rows"]:
-        *cells, robustness = _cells(row)
-        lines.append([*cells, robustness + _range(row)])
+        *others, robustness = cells(row)
+        lines.append([*others, robustness + _range(row)])
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
-
-
-def show(board: Mapping[str, Any]) -> None:
-    """Two tables that fit a terminal of 80 columns; robustness only if it was measured."""
-    from rich.table import Table
-
-    parts = {"performance v2 (float64)": ["score", *SHORT]}
-    if any(row["source"] == "measured" and row["robustness"] for row in board["rows"]):
-        parts["robustness v2"] = ["robust", *SHORT_ROBUSTNESS]
-    columns = ["score", *SHORT, *SHORT_ROBUSTNESS, "robust"]
-    for title, headings in parts.items():
-        table = Table(title=f"{board['robot']}: {title}", caption="* published")
-        for heading in ("controller", *headings):
-            justify = "left" if heading == "controller" else "right"
-            table.add_column(heading, justify=justify, no_wrap=True)
-        for row in board["rows"]:
-            cells = dict(zip(columns, _cells(row)[1:], strict=True))
-            style = "dim" if row["source"] == "published" else None
-            name = row["title"] + ("*" if row["source"] == "published" else "")
-            table.add_row(name, *(cells[heading] for heading in headings), style=style)
-        console.print(table)
 
 
 def _ships_policy(robot: str) -> bool:

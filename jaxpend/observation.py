@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from .errors import JaxpendError, choose
+from .fields import Checked, Natural, Positive
 
 if TYPE_CHECKING:
     import jax
@@ -37,23 +37,16 @@ KINDS = {"wrapped": (_wrapped, (-1,) * 4), "sincos": (_sincos, (1, 1, -1, -1, -1
 
 
 @dataclasses.dataclass(frozen=True)
-class Observation:
+class Observation(Checked):
     """How a state (4,), and what came before it, become an observation (``size``,).
 
     Raises ``JaxpendError`` for an unknown kind, a velocity scale that is not positive, or a
     negative history.
     """
 
-    kind: str = "sincos"
-    max_velocity: float = 20.0  # rad/s, velocities are divided by it
-    history: int = 0  # past states and actions that are seen too, one control period apart
-
-    def __post_init__(self):
-        choose("observation kind", self.kind, KINDS)
-        if not self.max_velocity > 0:
-            raise JaxpendError(f"max_velocity is {self.max_velocity} rad/s; it must be positive")
-        if self.history < 0:
-            raise JaxpendError(f"history is {self.history}; it must not be negative")
+    kind: Literal["wrapped", "sincos"] = "sincos"
+    max_velocity: Positive = 20.0  # rad/s, velocities are divided by it
+    history: Natural = 0  # past states and actions that are seen too, one control period apart
 
     @property
     def size(self) -> int:

@@ -11,7 +11,7 @@ the comparison fair. Other strategies of evosax stand behind the same options.
 
 import dataclasses
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from evosax import algorithms
 
 from . import config
 from .boards import Task, own_task
-from .config import GuardConfig, SNESConfig
+from .config import GuardConfig, Run, SNESConfig
 from .controller import Controller, check_controller
 from .controllers.guard import guard
 from .controllers.policy import change_policies
@@ -221,7 +221,7 @@ class SNES(SearchStage):
         self.evolve_all = jax.jit(evolve_all, static_argnames="count")
 
     @classmethod
-    def of(cls, run, start, task):
+    def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
         config = getattr(run, "snes", None)
         return cls(config, start, task, getattr(run, "guard", None)) if config else None
 
@@ -230,7 +230,7 @@ class SNES(SearchStage):
         options = dataclasses.asdict(self.guarding)
         return guard(controller, self.task.robot, self.task.plant, **options)
 
-    def start(self, seed, before):
+    def start(self, seed: int, before: Controller) -> SearchState:
         return self._begin(self.guarded(before), *self._keys(seed))
 
     def _keys(self, seed):
@@ -240,10 +240,10 @@ class SNES(SearchStage):
         search = init(self.config, start, key_init)
         return SearchState(start, search, jnp.asarray(0), key_fresh)
 
-    def like(self):
+    def like(self) -> SearchState:
         return jax.eval_shape(self._begin, self.policy, *self._keys(0))
 
-    def advance(self, states):
+    def advance(self, states: list[SearchState]) -> list[tuple[SearchState, dict[str, Any]]]:
         count = self.chunk(states[0])
         both = [(state.start, state.search) for state in states]
         if len(states) == 1:
@@ -257,9 +257,12 @@ class SNES(SearchStage):
             for state, (search, metrics) in zip(states, after, strict=True)
         ]
 
-    def judge(self, state, metrics):
-        row = {"diverged": int(state.search.diverged)}
+    def judge(
+        self, state: SearchState, metrics: dict[str, Any]
+    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
+        row: dict[str, Any] = {"diverged": int(state.search.diverged)}
         row |= {name: values[-1] for name, values in metrics.items()}
+        assert state.fresh is not None
         key, candidates = jax.random.fold_in(state.fresh, self.done(state)), []
         for name, policy_of in {"mean": mean_controller, "individual": best_controller}.items():
             policy = policy_of(self.config, state.start, state.search)
@@ -269,10 +272,10 @@ class SNES(SearchStage):
             candidates.append((policy, worth))
         return row, candidates
 
-    def note(self, row):
+    def note(self, row: dict[str, Any]) -> str:
         return f"fitness {float(row['mean_fitness']):.3f}  mean {row['mean_score']:.4f}"
 
-    def watched(self, state):
+    def watched(self, state: SearchState) -> Any:
         return state.search.strategy.mean, state.search.strategy.std
 
 

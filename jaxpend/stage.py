@@ -15,7 +15,7 @@ import jax
 from .boards import Task
 from .config import GradientConfig, Run, SNESConfig
 from .controller import Controller
-from .pytree import pytree
+from .pytree import Pytree, pytree
 from .score import imperfect, nominal
 
 __all__ = ["Chart", "SearchStage", "SearchState", "Stage", "value"]
@@ -132,7 +132,7 @@ def value(
 
 
 @pytree
-class SearchState:
+class SearchState(Pytree):
     """A search on a controller's parameters."""
 
     start: Controller  # the origin of the coordinates, and all that is not searched

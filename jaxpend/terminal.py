@@ -1,60 +1,24 @@
-"""What people read on the terminal: score tables and live progress."""
+"""What people watch on the terminal: the console, and live progress."""
 
 import time
-from collections.abc import Mapping
-from typing import Any
+from typing import NoReturn
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
-from .boards import HEADINGS, v2
+__all__ = ["LiveProgress", "console"]
 
-__all__ = ["LiveProgress", "console", "robustness_table", "score_table"]
+
+class _Console(Console):
+    def on_broken_pipe(self) -> NoReturn:
+        """Let the command line see that nobody reads any more, like of every other output."""
+        raise BrokenPipeError
+
 
 # Progress and tables go to standard error, so that standard output stays machine-readable.
-console = Console(stderr=True)
-
-
-def score_table(results: Mapping[str, Mapping], robot: str) -> None:
-    """Print official results (``score.official``), a column each, and the published scores."""
-    table = Table(title=f"{robot}: official v2 score (float64)")
-    table.add_column("")
-    for name in results:
-        table.add_column(name, justify="right")
-    table.add_row("score", *(f"[bold]{r['score']:.4f}[/bold]" for r in results.values()))
-    table.add_row("success", *("yes" if r["success"] else "no" for r in results.values()))
-    for key, (heading, unit, form) in HEADINGS.items():
-        cells = (format(r["criteria"][key], form) for r in results.values())
-        table.add_row(f"{heading} \\[{unit}]", *cells)
-    console.print(table)
-    published = ", ".join(f"{name} {score:.3f}" for name, score, _ in v2(robot).published)
-    console.print(f"published: {published}", style="dim")
-
-
-def robustness_table(result: dict[str, Any], robot: str) -> None:
-    """Six percentages and the overall score, on standard error like all reports."""
-    from .robustness import CRITERIA  # loads jax
-
-    table = Table(title=f"{robot}: robustness, {result['simulations']} runs of 10 s")
-    for heading in ("", "score [%]", "over keys [%]", "diverged"):
-        table.add_column(heading, justify="right" if heading else "left")
-    over = result["over_keys"]
-    several = len(over["overall"]) > 1
-    for name, title in CRITERIA.items():
-        drawn = over["scores"].get(name) if several else None
-        spread = f"{100 * min(drawn):.1f} to {100 * max(drawn):.1f}" if drawn else ""
-        diverged = str(result["criteria"][name]["diverged"])
-        table.add_row(title, f"{100 * result['scores'][name]:.1f}", spread, diverged)
-    spread = f"{100 * over['mean']:.1f} ± {100 * over['std']:.1f}" if several else ""
-    table.add_row("Overall", f"[bold]{100 * result['overall']:.1f}[/bold]", spread, "")
-    console.print(table)
-    seconds = f"{result['run_seconds']:.1f} s for {len(over['overall'])} key" + "s" * several
-    console.print(f"{seconds}, compiled in {result['compile_seconds']:.1f} s", style="dim")
-    worst = result.get("worst")
-    if worst:
-        values = ", ".join(f"{k} = {v:.3g}" for k, v in (worst["values"] or {}).items())
-        console.print(f"{100 * worst['failures']:.1f} % of combined imperfections fail; {values}")
+console = _Console(stderr=True)
+if console.width < 40:  # no room for the tables: let the terminal break their lines
+    console.width = 80
 
 
 class LiveProgress:

@@ -1,12 +1,13 @@
 """What every command shares: exit codes, one-sentence errors, strict JSON, configuration."""
 
-import importlib
 import json
 import math
 import os
+import resource
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Literal
 
@@ -16,9 +17,10 @@ import numpy as np
 import pytest
 
 import jaxpend
-from jaxpend import JaxpendError, __version__, cli
-from jaxpend.cli import app, commands
+from jaxpend import JaxpendError, __version__, cli, designs
+from jaxpend.cli import cache, commands
 from jaxpend.config import TrainRun
+from jaxpend.fields import Count
 from jaxpend.train.interrupt import Stopped
 
 RECIPE = "pendubot"
@@ -35,14 +37,14 @@ RECIPE = "pendubot"
     ],
 )
 def test_what_goes_wrong_is_one_sentence_and_an_exit_code(capsys, error, code, words):
-    with pytest.raises(SystemExit) as exit_, cli.guard("prog"):
+    with pytest.raises(SystemExit) as exit_, cli.one_sentence("prog"):
         raise error
     assert exit_.value.code == code
     assert capsys.readouterr() == ("", words)
 
 
 def test_other_errors_are_bugs_and_keep_their_traceback():
-    with pytest.raises(ZeroDivisionError), cli.guard("prog"):
+    with pytest.raises(ZeroDivisionError), cli.one_sentence("prog"):
         1 / 0  # noqa: B018
 
 
@@ -50,7 +52,7 @@ def main(
     where: Path = Path("here"),
     /,
     robot: str = "pendubot",
-    keys: int = 3,
+    keys: Count = 3,
     plot: bool = True,
     kind: Literal["fast", "slow"] = "fast",
     pair: tuple[str, str] | None = None,
@@ -81,6 +83,10 @@ def run(monkeypatch, capsys, arguments, function=main):
         ("--plot=no", "here pendubot 3 False fast None\n"),
         ("--plot off --keys 1", "here pendubot 1 False fast None\n"),
         ("--plot YES --pair a b", "here pendubot 3 True fast ('a', 'b')\n"),
+        ("--plot --pair a b", "here pendubot 3 True fast ('a', 'b')\n"),
+        ("--plot there", "there pendubot 3 True fast None\n"),
+        ("--pair None --keys 1 --keys 2", "here pendubot 2 True fast None\n"),
+        ("-", "- pendubot 3 True fast None\n"),
     ],
 )
 def test_run_parses_calls_and_exits(monkeypatch, capsys, arguments, out):
@@ -99,11 +105,23 @@ def test_run_parses_calls_and_exits(monkeypatch, capsys, arguments, out):
         ("--keys many", "--keys is 'many'; it must be an integer"),
         ("--keys=1.5", "--keys is '1.5'; it must be an integer"),
         ("--keys", "--keys needs a value: an integer"),
-        ("--plot perhaps --keys x", "--keys is 'x'; it must be an integer"),
+        ("--keys --plot", "--keys needs a value: an integer"),
+        ("--keys=", "--keys is ''; it must be an integer"),
+        ("--keys 0", "--keys is 0; it must be positive"),
+        ("--keys -3", "--keys is -3; it must be positive"),
+        ("--keys 1e3", "--keys is '1e3'; it must be an integer"),
+        (
+            "--keys 99999999999",
+            "--keys is 99999999999; it must be from -2,147,483,647 to 2,147,483,647",
+        ),
+        ("here --plot perhaps --keys x", "--plot is 'perhaps'; it must be yes or no"),
         ("here --plot perhaps", "--plot is 'perhaps'; it must be yes or no"),
-        ("here --plot= --keys 1", "unexpected argument ''; see prog --help"),
+        ("here --plot= --keys 1", "--plot is ''; it must be yes or no"),
         ("--kind quick", "--kind is 'quick'; it must be fast or slow"),
         ("--pair a", "--pair is 'a'; it must be 2 values, each a text"),
+        ("--no-plot=yes", "--no-plot takes no value; --plot does"),
+        ("--no-plat", "unknown option --no-plat; did you mean --no-plot?"),
+        ("--robo acrobot", "unknown option --robo; did you mean --robot?"),
     ],
 )
 def test_what_is_wrong_on_the_command_line_is_one_sentence(monkeypatch, capsys, arguments, words):
@@ -116,13 +134,30 @@ def test_what_is_wrong_on_the_command_line_is_one_sentence(monkeypatch, capsys, 
         ("--sac.stepz 4", "unknown option --sac.stepz; did you mean --sac.steps?"),
         ("--steps 4", "unknown option --steps; did you mean --sac.steps?"),
         ("--sac.steps x", "--sac.steps is 'x'; it must be an integer"),
-        ("--sac.actor_hidden 8 a", "--sac.actor-hidden is '8 a'; it must be any number of values, "
-         "each an integer"),
+        ("--sac.actor-hidden 8 a", "--sac.actor_hidden is '8 a'; it must be one or more values, "
+         "each of which must be an integer"),
+        ("--sac.actor-hidden 8 0", "--sac.actor_hidden is '8 0'; it must be one or more values, "
+         "each of which must be positive"),
         ("--sac.env.reward.line up", "--sac.env.reward.line is 'up'; it must be a number"),
+        ("--sac.env.dt nan", "--sac.env.dt is nan; it must be positive"),
+        ("--sac.env.dt -inf", "--sac.env.dt is -inf; it must be positive"),
+        ("--sac.env.dt inf", "--sac.env.dt is inf; it must be finite"),
+        ("--sac.target-entropy nan", "--sac.target_entropy is nan; it must be a number"),
+        ("--sac.env.robot acrobot", "unknown option --sac.env.robot; did you mean --sac.env.dt?"),
+        ("--sac.replay-capacity 8", "--sac.replay_capacity is 8; it must hold at least one step of "
+         "all 32 environments"),
+        ("--seed -1", "--seed is -1; it must not be negative"),
+        ("--seed 2147483647", "--seed is 2147483647; it must be below 2,147,483,647"),
+        ("--seed 2147483640 --seeds 8", "--seeds is 8; from seed 2147483640 on there are not so "
+         "many"),
+        ("--plant a.yaml --design C.1/1.0", "--plant and design are both given; a run has one of "
+         "them"),
         ("--conf x", "unknown option --conf; did you mean --config?"),
-        ("--config", "--config needs a YAML file"),
-        ("--config --seed 3", "--config needs a YAML file"),
-        ("--sac.steps 0", "steps is 0; it must be positive"),
+        ("--config", "--config needs a YAML file, or a recipe: acrobot, pendubot, plain"),
+        ("--config --seed 3", "--config needs a YAML file, or a recipe: acrobot, pendubot, plain"),
+        ("--config nothing", "there is no configuration file nothing, and no such recipe: acrobot, "
+         "pendubot, plain"),
+        ("--sac.steps 0", "--sac.steps is 0; it must be positive"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_in_a_configuration_is_one_sentence(monkeypatch, capsys, arguments, words):
@@ -142,14 +177,6 @@ def test_what_is_wrong_in_a_configuration_is_one_sentence(monkeypatch, capsys, a
 def test_unknown_commands_are_one_sentence(monkeypatch, capsys, arguments, words):
     done = run(monkeypatch, capsys, arguments, cli.main)
     assert done == (2, "", f"jaxpend: {words}\n")
-
-
-def test_without_the_hook_tyro_says_what_is_wrong(monkeypatch, capsys):
-    monkeypatch.delattr("tyro._errors.on_parse_error")
-    code, out, err = run(monkeypatch, capsys, "--keis 5")
-    assert (code, out) == (2, "")
-    assert "--keis" in err
-    assert "Traceback" not in err
 
 
 def test_version_names_what_results_depend_on(monkeypatch, capsys):
@@ -215,8 +242,7 @@ def test_help_has_an_example_that_parses(monkeypatch, capsys, name):
     example = cli.COMMANDS[name].example
     assert (code, err) == (0, "")
     assert f"example: jaxpend {name} {example}" in " ".join(out.split())
-    module, _, function = (cli.COMMANDS[name].function or f"commands:{name}").partition(":")
-    function = getattr(importlib.import_module(f"jaxpend.cli.{module}"), function)
+    function = getattr(commands, name)
     call = cli.parse(function, "prog", example.split())
     assert call.func is function
     assert call.args or call.keywords
@@ -243,18 +269,18 @@ def test_where_compiled_programs_are_kept(monkeypatch, tmp_path):
     for name in ("JAXPEND_CACHE", "JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert app._cache_folder() == tmp_path / ".cache" / "jaxpend" / "xla"
+    assert cache.cache_folder() == tmp_path / ".cache" / "jaxpend" / "xla"
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
-    assert app._cache_folder() == tmp_path / ".cache" / "jaxpend" / "xla"
+    assert cache.cache_folder() == tmp_path / ".cache" / "jaxpend" / "xla"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert app._cache_folder() == tmp_path / "xdg" / "jaxpend" / "xla"
+    assert cache.cache_folder() == tmp_path / "xdg" / "jaxpend" / "xla"
     for off in ("off", "0", "No", "FALSE"):
         monkeypatch.setenv("JAXPEND_CACHE", off)
-        assert app._cache_folder() is None
+        assert cache.cache_folder() is None
     monkeypatch.setenv("JAXPEND_CACHE", "~/mine")
-    assert app._cache_folder() == tmp_path / "mine"
+    assert cache.cache_folder() == tmp_path / "mine"
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "jax")
-    assert app._cache_folder() is None
+    assert cache.cache_folder() is None
 
 
 def score(**environment):
@@ -323,7 +349,7 @@ def test_options_override_the_file_which_overrides_the_defaults(tmp_path):
         config = configured(*named, "--seed", 5, "--sac.env.reward.line", 0.4)
         assert (config.robot, config.seed, config.sac.discount) == ("acrobot", 5, 0.9)
         assert config.sac.actor_hidden == (4, 5)
-        assert (config.sac.env.robot, config.sac.env.reward.line) == ("acrobot", 0.4)
+        assert config.sac.env.reward.line == 0.4
         assert config.snes == TrainRun().snes
 
 
@@ -334,8 +360,216 @@ def test_flags_of_a_section_are_yes_or_no():
         assert not configured(*arguments).sac.critic_layer_norm
 
 
-def test_the_robot_option_reaches_the_environment():
-    config = configured("--robot", "acrobot")
-    assert (config.sac.env.robot, config.sac.env.reward.line) == ("acrobot", 0.375)
-    config = configured("--robot", "acrobot", "--sac.env.reward.line", 0.4)
-    assert config.sac.env.reward.line == 0.4
+# --- the process around a command ----------------------------------------------------------
+
+
+def command(line, stdout=subprocess.PIPE, **environment):
+    """A command in a shell, as a process of its own; ``jaxpend`` is this package's."""
+    line = line.replace("jaxpend", f"{sys.executable} -m jaxpend", 1)
+    return subprocess.run(
+        ["bash", "-c", line], stdout=stdout, stderr=subprocess.PIPE, text=True, timeout=120,
+        env=os.environ | environment, pass_fds=[stdout] if stdout > 2 else (),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """A folder with a run in it."""
+    (tmp_path / "runs" / "mine").mkdir(parents=True)
+    (tmp_path / "runs" / "mine" / "config.json").write_text('{"robot": "acrobot", "seed": 1}')
+    return tmp_path / "runs"
+
+
+@pytest.mark.parametrize(
+    ("line", "code"),
+    [("--help", 141), ("train -H", 141), ("runs {} --json -", 141), ("runs {} 2>&1", 141),
+     ("runs {}/none 2>&1", 2)],
+)  # fmt: skip
+def test_nobody_reads_the_output_any_more(runs, line, code):
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = command(f"jaxpend {line.format(runs)}".replace("2>&1", f"2>&{writer}"), stdout=writer)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (code, "")
+
+
+def test_output_that_is_closed_or_full(runs):
+    done = command(f"jaxpend runs {runs} --json - >&-")
+    words = "jaxpend runs: standard output is closed; name a file instead of -\n"
+    assert (done.returncode, done.stderr) == (2, words)
+    assert command(f"jaxpend runs {runs} >&- 2>&-").returncode == 0
+    assert command(f"jaxpend runs {runs}/none >&- 2>&-").returncode == 2
+    done = command(f"jaxpend runs {runs} --json - >/dev/full")
+    words = "jaxpend runs: cannot use: No space left on device\n"
+    assert (done.returncode, done.stderr) == (2, words)
+
+
+@pytest.mark.parametrize("columns", ["0", "1", "-5", "wide"])
+def test_a_terminal_with_no_room_is_written_beyond(runs, columns):
+    for line in ("--help", "train --help", "robustness -H"):
+        done = command(f"jaxpend {line}", COLUMNS=columns)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert "--config" in done.stdout or "--map" in done.stdout
+    done = command(f"jaxpend runs {runs}", COLUMNS=columns)
+    assert done.returncode == 0
+    assert "mine" in done.stderr
+
+
+def test_a_platform_that_is_not_there_is_said():
+    for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
+        done = command("jaxpend score", **{name: "nonsense"})
+        assert done.returncode == 2
+        start = f"jaxpend score: {name} is 'nonsense', which jax cannot use here: "
+        assert done.stderr.startswith(start)
+        assert done.stderr.count("\n") == 1
+
+
+# The first look at a descriptor comes right after the handler is there.
+INTERRUPTED = """
+import os
+from jaxpend.__main__ import main
+look = os.fstat
+def ready(descriptor):
+    os.fstat = look
+    print(flush=True)
+    return look(descriptor)
+os.fstat = ready
+main()
+"""
+
+
+@pytest.mark.parametrize("line", ["score", "train --runs {}"])
+@pytest.mark.parametrize("seconds", [0.05, 0.1, 0.2, 0.3, 0.5, 0.8])
+def test_ctrl_c_in_the_first_second_is_one_line(tmp_path, line, seconds):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # children inherit "ignored"
+    pipe = subprocess.PIPE
+    arguments = [sys.executable, "-c", INTERRUPTED, *line.format(tmp_path).split()]
+    with subprocess.Popen(arguments, stdout=pipe, stderr=pipe, text=True) as process:
+        signal.signal(signal.SIGINT, before)
+        process.stdout.readline()
+        time.sleep(seconds)
+        process.send_signal(signal.SIGINT)
+        assert process.stderr.read() == "jaxpend: interrupted\n"
+    assert process.returncode == 130
+
+
+def test_help_takes_little_time():
+    def used():
+        usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return usage.ru_utime + usage.ru_stime
+
+    seconds = []
+    for line in ("--help", "train --help", "train --help"):
+        before = used()
+        assert command(f"jaxpend {line}").returncode == 0
+        seconds.append(used() - before)
+    assert min(seconds) < 0.3
+
+
+def test_help_shows_choices_and_with_capital_h_what_fields_mean():
+    short, full = (command(f"jaxpend train {h}").stdout for h in ("--help", "-H"))
+    for text in (short, full):
+        assert "--on-divergence stop|rollback (default: stop)" in text
+        assert "--snes.strategy snes|sep_cma_es|lm_ma_es|open_es (default: snes)" in text
+        assert "--sac.actor-hidden INTEGER ... (default: 128 128)" in text
+        assert "--sac.mirror, --sac.no-mirror (default: no)" in text
+    about = ("gradient updates per vector step", "Polyak averaging of the target critics")
+    assert all(words in full and words not in short for words in about)
+    assert "\n\nsac.env: The learning environment.\n" in short
+
+
+# --- what the commands refuse before they compute ------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("robustness --keys 0", "--keys is 0; it must be positive"),
+        ("robustness --chunk 0", "--chunk is 0; it must be positive"),
+        ("robustness --worst -5", "--worst is -5; it must not be negative"),
+        ("robustness --seed -1", "--seed is -1; it must not be negative"),
+        ("robustness --seed 2147483647", "--seed is 2147483647; it must be below 2,147,483,647"),
+        ("robustness --torque-limit nan", "--torque-limit is nan; it must be positive"),
+        ("robustness --torque-limit inf", "--torque-limit is inf; it must be finite"),
+        ("robustness --map m2", "--map is 'm2'; it must be 2 values, each a text"),
+        ("robustness --robot tricycle", "--robot is 'tricycle'; it must be acrobot or pendubot"),
+        ("robustness --out {file}", "cannot write into {file}: {file} is not a folder"),
+        ("robustness --out {file}/a/b", "cannot write into {file}/a/b: {file} is not a folder"),
+        ("robustness --json {folder}", "cannot write {folder}: it is a folder"),
+        ("leaderboard --out {folder}", "cannot write {folder}: it is a folder"),
+        ("leaderboard --keys 0", "--keys is 0; it must be positive"),
+        ("optimise", "--robot is missing; see jaxpend optimise --help"),
+        ("optimise --robot acrobot --out {file}/a", "cannot write into {file}: {file} is not a "
+         "folder"),
+        ("optimise --robot acrobot --search.horizons", "--search.horizons needs a value: one or "
+         "more values, each a number"),
+        ("optimise --robot acrobot --search.starts -1", "--search.starts is -1; it must be "
+         "positive"),
+        ("report", "RUN is missing; see jaxpend report --help"),
+        ("report acrobot --out {file}", "cannot write into {file}: {file} is not a folder"),
+        ("score --json {file}/a", "cannot write into {file}: {file} is not a folder"),
+        ("runs {folder} --json {folder}", "cannot write {folder}: it is a folder"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused_before_anything_runs(monkeypatch, capsys, tmp_path, line, words):
+    (tmp_path / "file").touch()
+    names = {"file": tmp_path / "file", "folder": tmp_path}
+    line = line.format(**names)
+    assert run(monkeypatch, capsys, line, cli.main) == (
+        2, "", f"jaxpend {line.split()[0]}: {words.format(**names)}\n",
+    )  # fmt: skip
+
+
+def test_a_folder_that_is_not_writable(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    code, out, err = run(monkeypatch, capsys, f"robustness --out {tmp_path}/new", cli.main)
+    words = f"cannot write into {tmp_path}/new: {tmp_path} is not writable\n"
+    assert (code, out, err) == (2, "", f"jaxpend robustness: {words}")
+
+
+def test_optimise_knows_its_command_line():
+    line = ["--robot", "acrobot", "--search.starts=8", "--out", "a b"]
+    call = cli.parse(commands.optimise, "jaxpend optimise", line)
+    assert (
+        call.keywords["command"] == "jaxpend optimise --robot acrobot --search.starts=8 --out 'a b'"
+    )
+    assert call.keywords["search"].starts == 8
+
+
+def test_judging_on_another_plant(tmp_path, capsys):
+    path = tmp_path / "own.yaml"
+    path.write_text(json.dumps(designs.parameters("C.1/1.0")))
+
+    def judged(**where):
+        commands.score("acrobot", controller="tvlqr", json="-", **where)
+        return json.loads(capsys.readouterr().out)
+
+    on_board, by_name, by_file = judged(), judged(design="C.1/1.0"), judged(plant=str(path))
+    assert by_name["criteria"] == by_file["criteria"] != on_board["criteria"]
+    assert (by_name["design"], by_file["plant"]) == ("C.1/1.0", str(path))
+    assert (on_board["controller"], on_board["policy"], on_board["header"]) == (
+        "tvlqr",
+        None,
+        None,
+    )
+
+
+@pytest.mark.parametrize("name", ["score", "robustness", "leaderboard"])
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--plant nothing.yaml", "cannot read nothing.yaml: No such file or directory"),
+        ("--design C.9/1.0", "unknown design 'C.9/1.0'; known: A.0/"),
+        ("--plant a --design C.1/1.0", "plant a and design C.1/1.0 are both given"),
+    ],
+)
+def test_plants_that_are_not_there(monkeypatch, capsys, name, options, words):
+    code, out, err = run(monkeypatch, capsys, f"{name} {options}", cli.main)
+    assert (code, out) == (2, "")
+    assert err.startswith(f"jaxpend {name}: {words}")
+    assert err.count("\n") == 1
+
+
+def test_a_run_knows_its_plant():
+    config = configured("--design", "C.1/1.0", "--robot", "acrobot")
+    assert (config.plant, config.design) == ("", "C.1/1.0")

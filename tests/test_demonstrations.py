@@ -155,7 +155,7 @@ def test_the_swing_up_is_that_of_the_robot():
     [
         ({"episodes": -1}, "episodes is -1; it must not be negative"),
         ({"delay": -0.1}, "delay is -0.1; it must not be negative"),
-        ({"duration": 0.0}, "duration is 0.0; it must be positive"),
+        ({"duration": 0.0}, "duration is 0.0; it must be at least 0.01"),
         ({"updates": 0}, "updates is 0; it must be positive"),
         ({"learning_rate": -1.0}, "learning_rate is -1.0; it must be positive"),
     ],

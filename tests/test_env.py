@@ -294,15 +294,14 @@ def test_episode_steps():
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"robot": "cartpole"}, "unknown robot 'cartpole'; known: acrobot, pendubot"),
         ({"torque_limit": 0.0}, "torque_limit is 0.0; it must be positive"),
         ({"torque_limit": -3.0}, "torque_limit is -3.0; it must be positive"),
         ({"dt": math.nan}, "dt is nan; it must be positive"),
-        ({"duration": -1.0}, "duration is -1.0; it must be positive"),
+        ({"duration": -1.0}, "duration is -1.0; it must be at least 0.01"),
         ({"max_speed": 0.0}, "max_speed is 0.0; it must be positive"),
-        ({"upright_starts": -0.1}, "upright_starts is -0.1; it is a share, from 0 to 1"),
+        ({"upright_starts": -0.1}, "upright_starts is -0.1; it must not be negative"),
         ({"upright_spread": 0.0}, "upright_spread is 0.0; it must be positive"),
-        ({"randomised": 1.5}, "randomised is 1.5; it is a share, from 0 to 1"),
+        ({"randomised": 1.5}, "randomised is 1.5; it must be at most 1"),
     ],
 )
 def test_senseless_values_are_one_sentence(values, words):

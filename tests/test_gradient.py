@@ -186,11 +186,11 @@ def test_gains_of_any_controller_climb_with_a_step_of_their_own():
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"steps": -1}, "steps and scenarios must not be negative"),
+        ({"steps": -1}, "steps is -1; it must not be negative"),
         ({"clip": 0.0}, "clip is 0.0; it must be positive"),
         ({"memory": float("nan")}, "memory is nan; it must be positive"),
-        ({"scenarios": -1}, "steps and scenarios must not be negative"),
-        ({"scenario_weight": 1.5}, "scenario_weight lies in 0 to 1"),
+        ({"scenarios": -1}, "scenarios is -1; it must not be negative"),
+        ({"scenario_weight": 1.5}, "scenario_weight is 1.5; it must be at most 1"),
     ],
 )
 def test_senseless_values_are_one_sentence(values, words):

@@ -176,7 +176,7 @@ def test_files_of_the_first_format_still_load(tmp_path):
         (lambda a, h: h.update(torque_limit=0.0), "not finite or not positive"),
         (lambda a, h: h.update(robot="cartpole"), "unknown robot 'cartpole'"),
         (lambda a, h: h.update(activation="exp"), "unknown activation 'exp'"),
-        (lambda a, h: h["observation"].update(kind="pixels"), "unknown observation kind"),
+        (lambda a, h: h["observation"].update(kind="pixels"), "it must be wrapped or sincos"),
         (lambda a, h: h.update(control_dt=-1.0), "the control period is -1.0 s; it must be in"),
         (lambda a, h: h.update(control_dt=float("nan")), "the control period is nan s"),
         (lambda a, h: h.update(control_dt=1e9), "the control period is 1000000000.0 s"),

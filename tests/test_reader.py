@@ -11,8 +11,9 @@ import pytest
 from conftest import refused
 
 from jaxpend import JaxpendError, cli
+from jaxpend.cli.tables import runs_table
 from jaxpend.files import to_json
-from jaxpend.runs.reader import listing, read_run, remarks, runs_table
+from jaxpend.runs.reader import listing, read_run, remarks
 
 STAGES = [
     {"name": "imitation", "title": "Imitation", "unit": "updates", "column": "updates",

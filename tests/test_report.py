@@ -18,11 +18,12 @@ from jaxpend import cli, load_policy, save_policy
 from jaxpend.boards import Board, v2
 from jaxpend.cli import commands
 from jaxpend.config import DemonstrationConfig, SACConfig, TrainRun
+from jaxpend.config_files import to_mapping
 from jaxpend.controllers.policy import network_in
 from jaxpend.pytree import pytree
 from jaxpend.report import page
 from jaxpend.runs import reader as report
-from jaxpend.runs.folder import RunFolder, changed, to_mapping
+from jaxpend.runs.folder import RunFolder, changed
 from jaxpend.score import official
 from jaxpend.train.loop import stages_of
 

@@ -309,11 +309,11 @@ def test_command_writes_json_csv_and_pictures(tmp_path, capsys):
     ("arguments", "words"),
     [
         (["--robot", "pendubot", "--policy", "policy.npz"], "a policy for the acrobot"),
-        (["--robot", "tricycle"], "unknown robot 'tricycle'; known: acrobot, pendubot"),
+        (["--robot", "tricycle"], "robot is 'tricycle'; it must be acrobot or pendubot"),
         (["--controller", "no_such_module:law"], "cannot load no_such_module:law"),
         (["--policy", "policy.npz", "--controller", "pd"], "a policy for the acrobot"),
         (["--worst", "-5"], "worst is -5; it must not be negative"),
-        (["--torque-limit", "0"], "torque_limit is 0.0; it must be positive"),
+        (["--torque-limit", "0"], "--torque-limit is 0.0; it must be positive"),
     ],
 )
 def test_command_refuses_bad_input_in_one_sentence(tmp_path, monkeypatch, capsys, arguments, words):

@@ -1,4 +1,4 @@
-"""Configurations from files, and what a run folder keeps."""
+"""What a run folder keeps."""
 
 import dataclasses
 import json
@@ -11,13 +11,13 @@ import pytest
 from conftest import limited_file_size, refused
 
 from jaxpend import JaxpendError, Policy, cli, load_policy
-from jaxpend.config import SACRun, SNESRun, TrainRun
+from jaxpend.config import SACRun, TrainRun
+from jaxpend.config_files import to_mapping
 from jaxpend.controllers.files import read_header
-from jaxpend.runs.folder import RunFolder, from_mapping, load_config, to_mapping
+from jaxpend.runs.folder import RunFolder
 from jaxpend.train import train
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
-SECTIONS = ("policy", "guard", "sac", "snes")  # that a command may have no field for
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,81 +36,6 @@ class Outer:
     name: str = "a"
     fast: bool = False
     inner: Inner = dataclasses.field(default_factory=Inner)
-
-
-def test_named_fields_are_replaced_and_the_others_kept():
-    changed = from_mapping(Outer(), {"count": 4, "inner": {"sizes": [5], "speed": 2}}, "x")
-    assert changed == Outer(count=4, inner=Inner(2.0, (5,)))
-    assert isinstance(changed.inner.speed, float)
-    assert from_mapping(Outer(), {}, "x") == Outer()
-
-
-def test_numbers_that_yaml_takes_for_text(tmp_path):
-    path = tmp_path / "c.yaml"
-    path.write_text("inner: {speed: 1e-3}")
-    assert load_config(Outer(), path).inner.speed == 1e-3
-
-
-@pytest.mark.parametrize("config", [Outer(name="b"), TrainRun("acrobot"), SNESRun(seed=4)])
-def test_a_stored_configuration_is_strict_json_and_reads_back(config, tmp_path):
-    path = RunFolder(tmp_path / "run", config, "command").path / "config.json"
-    json.loads(path.read_text(), parse_constant=pytest.fail)
-    assert load_config(type(config)(), path) == config
-    assert from_mapping(type(config)(), to_mapping(config), "x") == config
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("cout: 4", "unknown field 'cout'; known: count, name, fast, inner"),
-        ("inner: {sped: 4}", "inner: unknown field 'sped'; known: speed, sizes"),
-        ("count: many", "count: 'many' is not int"),
-        ("count: 1.5", "count: 1.5 is not int"),
-        ("count: true", "count: True is not int"),
-        ("name: 3", "name: 3 is not str"),
-        ("fast: 1", "fast: 1 is not bool"),
-        ("inner: {speed: fast}", "inner: speed: 'fast' is not float"),
-        ("inner: {speed: true}", "inner: speed: True is not float"),
-        ("inner: {sizes: 4}", "inner: sizes: 4 is not tuple"),
-        ("inner: 4", "inner: expected fields of Inner"),
-        ("- count", "expected fields of Outer"),
-        ("count: [", "is not valid YAML"),
-    ],
-)
-def test_bad_files_are_one_sentence(tmp_path, text, words):
-    path = tmp_path / "c.yaml"
-    path.write_text(text)
-    with refused(words, start=str(path)):
-        load_config(Outer(), path)
-
-
-def test_missing_and_binary_files_are_one_sentence(tmp_path):
-    with pytest.raises(JaxpendError, match=r"there is no configuration file .*nothing\.yaml"):
-        load_config(Outer(), tmp_path / "nothing.yaml")
-    (tmp_path / "binary").write_bytes(b"\xff\xfe\x00\x9f")
-    with pytest.raises(JaxpendError, match="is not valid YAML"):
-        load_config(Outer(), tmp_path / "binary")
-
-
-def test_sections_of_other_commands_are_passed_over_only_where_said(tmp_path):
-    path = tmp_path / "c.yaml"
-    path.write_text("count: 5\nsac: {steps: 1}")
-    assert load_config(Outer(), path, also=("sac",)) == Outer(count=5)
-    with pytest.raises(JaxpendError, match="unknown field 'sac'"):
-        load_config(Outer(), path, also=("snes",))
-    path.write_text("inner: {speed: 2}")  # a section that there is a field for is read
-    assert load_config(Outer(), path, also=("inner",)).inner.speed == 2
-    path.write_text("")
-    assert load_config(Outer(), path) == Outer()
-
-
-@pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
-def test_the_recipes_are_valid_for_every_training_command(robot):
-    path = robot
-    run = load_config(TrainRun(), path, SECTIONS)
-    assert run.robot == run.sac.env.robot == robot
-    assert run.sac.env.reward.line == {"acrobot": 0.375, "pendubot": 0.35}[robot]
-    assert load_config(SNESRun(), path, SECTIONS).snes == run.snes
 
 
 def small_policy():
@@ -277,7 +202,7 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path, capsys):
         os.seteuid(65534)
     try:
         for name in ("run", "new"):
-            with pytest.raises(SystemExit) as exit_, cli.guard("prog"):
+            with pytest.raises(SystemExit) as exit_, cli.one_sentence("prog"):
                 RunFolder(tmp_path / name, Outer(), "command")
             assert exit_.value.code == 2
             where = tmp_path / "run" / ".lock" if name == "run" else tmp_path / "new"

@@ -5,8 +5,8 @@ import json
 import pytest
 from conftest import assert_close
 
+from jaxpend.cli.tables import seeds_table
 from jaxpend.files import to_json
-from jaxpend.runs.seeds import seeds_table
 from jaxpend.runs.statistics import summary
 
 HEADINGS = {"start": "start", "sac": "after SAC", "snes": "after SNES"}

@@ -261,16 +261,16 @@ def test_a_generation_meets_one_noise_and_improves_the_policy(fit):
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"population": 1}, "population is 1; SNES compares at least two individuals"),
-        ({"population": 0}, "population is 0; it must be positive"),
+        ({"population": 1}, "population is 1; it must be at least 2"),
+        ({"population": 0}, "population is 0; it must be at least 2"),
         ({"sigma": 0.0}, "sigma is 0.0; it must be positive"),
         ({"action_noise": -0.1}, "action_noise is -0.1; it must not be negative"),
         ({"action_noise": float("nan")}, "action_noise is nan; it must not be negative"),
         ({"gain_sigma": 0.0}, "gain_sigma is 0.0; it must be positive"),
-        ({"strategy": "ga"}, "unknown strategy 'ga'; known: snes, sep_cma_es"),
+        ({"strategy": "ga"}, "strategy is 'ga'; it must be snes, sep_cma_es, lm_ma_es or"),
         ({"strategy": "open_es", "population": 5}, "population is 5; open_es needs pairs"),
-        ({"scenarios": -1}, "scenarios must not be negative"),
-        ({"scenario_weight": 1.5}, "scenario_weight lies in 0 to 1"),
+        ({"scenarios": -1}, "scenarios is -1; it must not be negative"),
+        ({"scenario_weight": 1.5}, "scenario_weight is 1.5; it must be at most 1"),
     ],
 )
 def test_senseless_values_are_one_sentence(values, words):

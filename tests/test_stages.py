@@ -14,7 +14,7 @@ from jaxpend import Policy, save_policy, stage
 from jaxpend.boards import v2
 from jaxpend.config import GradientConfig, SNESConfig, SNESRun
 from jaxpend.gradient import Gradient
-from jaxpend.pytree import pytree
+from jaxpend.pytree import Pytree, pytree
 from jaxpend.report import page
 from jaxpend.runs.reader import find, listing, remarks
 from jaxpend.score import Criteria, nominal, score_v2
@@ -73,7 +73,7 @@ def test_scenarios_count_in_either_search(met):
 
 
 @pytree
-class Scale:
+class Scale(Pytree):
     """How often the policy has been changed, and the policy."""
 
     policy: Policy

@@ -42,6 +42,8 @@ def test_every_row_is_on_disk_once_whatever_went_before(tmp_path):
     own = tmp_path / "tensorboard" / "events.out.tfevents.1.mine"
     own.write_text("mine")
     write(tmp_path, ROWS[:1])  # killed, and taken up again from an older checkpoint
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('[]\n{"stage": "other", "at": 3}\n{"stage": "sac"}\n{"sta')
     events = Events(tmp_path, COLUMNS)
     for row in ROWS[1:]:
         events.add(row)

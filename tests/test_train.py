@@ -296,9 +296,9 @@ def one_sentence(err):
         (SNESRun, "--controller open_loop", "OpenLoop declares no searched parameters"),
         (SACRun, "--sac.env.torque-limit 0", "torque_limit is 0.0; it must be positive"),
         (TrainRun, "--sac.env.torque-limit -3", "torque_limit is -3.0; it must be positive"),
-        (TrainRun, "--robot cartpole", "unknown robot 'cartpole'; known: acrobot, pendubot"),
+        (TrainRun, "--robot cartpole", "robot is 'cartpole'; it must be acrobot or pendubot"),
         (TrainRun, "--config {}/nothing.yaml", "there is no configuration file"),
-        (TrainRun, "--config {}/unknown.yaml", "unknown field 'stepz'; known: env, steps"),
+        (TrainRun, "--config {}/unknown.yaml", "sac.stepz is unknown; known: env, steps"),
         (TrainRun, "--runs {}/acrobot.npz", "cannot use"),
     ],
 )
@@ -348,7 +348,7 @@ def test_score_command_prints_json_and_nothing_else(tmp_path):
         ("--policy {}/nothing.npz", "there is no policy file"),
         ("--policy {}/acrobot.npz", "is a policy for the acrobot, not for the pendubot"),
         ("--policy {}/empty.npz", "is not a policy file, or it is empty or cut off"),
-        ("--robot cartpole --policy {}/acrobot.npz", "unknown robot 'cartpole'; known: acrobot"),
+        ("--robot cartpole --policy {}/acrobot.npz", "robot is 'cartpole'; it must be acrobot or"),
     ],
 )
 def test_bad_input_to_the_score_command_is_one_sentence(

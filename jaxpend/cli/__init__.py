@@ -1,5 +1,17 @@
 """The command line."""
 
-from .app import COMMANDS, Command, compile_cache, emit_json, guard, main, parse, run
+from .app import COMMANDS, Command, main, one_sentence, run
+from .cache import compile_cache
+from .options import parse
+from .output import emit_json
 
-__all__ = ["COMMANDS", "Command", "compile_cache", "emit_json", "guard", "main", "parse", "run"]
+__all__ = [
+    "COMMANDS",
+    "Command",
+    "compile_cache",
+    "emit_json",
+    "main",
+    "one_sentence",
+    "parse",
+    "run",
+]

@@ -1,21 +1,29 @@
 """The functions behind the subcommands: parameters are options, docstrings the help.
 
-Nothing heavy is imported before a command runs, so that its help does not wait for jax.
+Nothing heavy is imported before a command runs, so that its help does not wait for jax, and names
+for results are checked before it computes.
 """
 
 import dataclasses
 import sys
 import time
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from ..config import GradientRun, SACRun, Search, SNESRun, TrainRun
-from ..errors import JaxpendError
+from ..config import GradientRun, Run, SACRun, Search, SNESRun, TrainRun
+from ..fields import Count, Natural, Positive, Robot, Seed
 from ..files import write_atomically
-from ..robots import active_joint
-from .app import emit_json
+from .output import check_file, check_folder, emit_json
+
+if TYPE_CHECKING:
+    import jax
+
+    from ..boards import Board
+    from ..controller import Controller
+    from ..plant import Plant
 
 __all__ = [
+    "execute",
     "gradient",
     "leaderboard",
     "optimise",
@@ -31,30 +39,49 @@ __all__ = [
 
 def train(config: TrainRun, command: str) -> None:
     """SAC on the surrogate reward, then the gradient and SNES on the score, in a run folder."""
-    from ..train.loop import execute
-
     execute(config, command)
 
 
 def sac(config: SACRun, command: str) -> None:
     """SAC on the surrogate reward, in a run folder."""
-    from ..train.loop import execute
-
     execute(config, command)
 
 
 def gradient(config: GradientRun, command: str) -> None:
     """The gradient of the smooth score, from a policy or any other controller, in a run folder."""
-    from ..train.loop import execute
-
     execute(config, command)
 
 
 def snes(config: SNESRun, command: str) -> None:
     """SNES on the official score, from a policy or any other controller, in a run folder."""
-    from ..train.loop import execute
-
     execute(config, command)
+
+
+def execute(config: Run, command: str) -> None:
+    """``train.train``, then the score table, and where the results are."""
+    board = _board(config.robot, config.plant, config.design)
+    from ..runs.reader import read_run
+    from ..terminal import console
+    from ..train import train
+    from .tables import score_table, seeds_table
+
+    result = train(config, command)
+    if config.seeds > 1:
+        seeds_table(result)
+    else:
+        score_table(read_run(config.folder).results, board)
+    console.print(f"policy.npz, metrics and result are in [bold]{config.folder}[/bold]")
+
+
+def _board(robot: str, plant: str | None, design: str | None) -> "Board":
+    """The v2 board of a robot; on another plant its scores are not comparable to published ones."""
+    from ..boards import task_of, v2
+
+    official, task = v2(robot), task_of(robot, plant, design)
+    if not (plant or design):
+        return official
+    name = f"{official.name} on {plant or design}"
+    return dataclasses.replace(official, name=name, task=task, published=())
 
 
 def runs(folder: Path = Path("runs"), /, json: str | None = None) -> None:
@@ -64,7 +91,9 @@ def runs(folder: Path = Path("runs"), /, json: str | None = None) -> None:
         folder: folder of run folders.
         json: write the list as JSON to this file, or "-" for standard output.
     """
-    from ..runs.reader import listing, runs_table
+    check_file(json)
+    from ..runs.reader import listing
+    from .tables import runs_table
 
     entries = listing(folder)
     if json != "-":
@@ -82,6 +111,8 @@ def report(run: Path, /, out: Path | None = None, robustness: bool = True) -> No
             runs/NAME.
         robustness: run the robustness benchmark too, seconds for every seed.
     """
+    folder = out or (run if run.is_dir() else Path("runs") / run.stem)
+    check_folder(folder)
     from ..runs.reader import find, remarks
     from ..terminal import console
 
@@ -90,98 +121,105 @@ def report(run: Path, /, out: Path | None = None, robustness: bool = True) -> No
         console.print(sentence, highlight=False, markup=False, soft_wrap=True)
     from ..report.page import write
 
-    folder = out or (run if run.is_dir() else Path("runs") / run.stem)
     page = write(found, folder, title=run.resolve().name, robustness=robustness)
     line = f"the report is {page}; pictures are in {page.with_suffix('')}"
     console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def score(robot: str = "pendubot", policy: str | None = None, json: str | None = None) -> None:
-    """Official v2 score of a policy or any other saved controller, in float64.
+def score(
+    robot: Robot = "pendubot",
+    policy: str | None = None,
+    controller: str | None = None,
+    plant: str | None = None,
+    design: str | None = None,
+    json: str | None = None,
+) -> None:
+    """Official v2 score of a policy or any other controller, in float64.
 
     Args:
-        robot: acrobot or pendubot.
+        robot: which joint is driven: the second of the acrobot, the first of the pendubot.
         policy: a policy or controller file; by default the policy that ships with the package.
+        controller: judge this instead: a known one such as tvlqr, or module:name of a
+            controller, or of a Python function (t, x) -> torque. With a policy too: the known one
+            around that policy, or the file of a controller of your own classes.
+        plant: YAML file of the parameters of another plant than that of the boards.
+        design: or an identified plant by name, such as C.1/1.0.
         json: write the result as JSON to this file, or "-" for standard output.
     """
-    active_joint(robot)
+    check_file(json)
     import jax
 
-    from ..controllers.files import load_controller, read_header
+    from ..controllers.catalogue import find_controller
+    from ..controllers.files import read_header
     from ..score import official
-    from ..terminal import score_table
+    from .tables import score_table
 
+    board = _board(robot, plant, design)
     with jax.enable_x64(True):
-        loaded = load_controller(policy or robot, robot=robot)
-    header = read_header(policy or robot)
-    result = official(loaded, robot) | {"policy": policy or robot, "header": header}
+        judged = find_controller(policy, controller, board.task)
+    file = policy or (None if controller else robot)
+    result = official(judged, board) | {"policy": file, "controller": controller}
+    result |= {"plant": plant, "design": design, "header": read_header(file) if file else None}
     if json != "-":
-        score_table({str(policy or f"shipped {robot}"): result}, robot)
+        score_table({controller or policy or f"shipped {robot}": result}, board)
     emit_json(result, json)
 
 
 def robustness(
-    robot: str = "pendubot",
+    robot: Robot = "pendubot",
     policy: str | None = None,
     controller: str | None = None,
-    torque_limit: float = 6.0,
-    seed: int = 0,
-    keys: int = 3,
+    plant: str | None = None,
+    design: str | None = None,
+    torque_limit: Positive = 6.0,
+    seed: Seed = 0,
+    keys: Count = 3,
     precision: Literal["float32", "float64"] = "float32",
     scored: bool = False,
     map: tuple[str, str] | None = None,
-    worst: int = 0,
-    chunk: int | None = None,
+    worst: Natural = 0,
+    chunk: Count | None = None,
     out: Path | None = Path("runs/robustness"),
     json: str | None = None,
 ) -> None:
     """The official six-criterion robustness benchmark of a controller.
 
     Args:
-        robot: acrobot or pendubot.
+        robot: which joint is driven: the second of the acrobot, the first of the pendubot.
         policy: a policy or controller file; by default the policy that ships with the package.
         controller: judge this instead: a known one such as tvlqr, or module:name of a
-            controller, or of a Python function (t, x) -> torque, which takes minutes (see
-            jaxpend.controllers.python). With a policy too: the known one around that policy, or
-            the file of a controller of your own classes.
+            controller, or of a Python function (t, x) -> torque, which takes minutes. With a
+            policy too: the known one around that policy, or the file of your own classes.
+        plant: YAML file of the parameters of another plant than that of the boards.
+        design: or an identified plant by name, such as C.1/1.0.
         torque_limit: of the driven joint, N m; 6 on the boards.
         seed: of the first key.
-        keys: repeat the criteria that draw something this often, for the spread.
+        keys: repeat the criteria that draw something this often; the median counts.
         precision: float32, or float64 as the reference computes.
         scored: the mean v2 performance score at every grid value as well.
         map: success over two imperfections, such as "m2 delay", 21 x 21 runs.
         worst: look for the mildest combination of imperfections that fails, in so many tries.
         chunk: runs at a time; less needs less memory.
-        out: folder for picture, CSV and JSON, with both robots side by side once both are
-            there; None writes nothing.
+        out: folder for picture, CSV and JSON, of both robots once they are there; or None.
         json: write the result as JSON to this file, or "-" for standard output.
     """
-    active_joint(robot)
-    if worst < 0:
-        raise JaxpendError(f"worst is {worst}; it must not be negative")
+    check_folder(out)
+    check_file(json)
     import jax
 
-    from .. import boards
     from ..controllers.catalogue import find_controller
-    from ..robustness import benchmark, nominal_and_worst, success_map
-    from ..sweep import mildest_failure
-    from ..terminal import robustness_table
+    from .tables import robustness_table
 
+    board = _board(robot, plant, design)
+    task = dataclasses.replace(board.task, torque_limit=torque_limit)
+    result = {"robot": robot, "controller": controller or policy or robot, "seed": seed}
+    result |= {"plant": plant, "design": design, "precision": precision}
+    result["torque_limit"] = torque_limit
     with jax.enable_x64(precision == "float64"):
-        task = dataclasses.replace(boards.v2(robot).task, torque_limit=torque_limit)
-        plant = task.plant
-        judged = find_controller(policy, controller, task)
-        key = jax.random.key(seed)
-        result = {"robot": robot, "controller": controller or policy or robot, "seed": seed}
-        result |= {"precision": precision, "torque_limit": torque_limit}
+        judged, key = find_controller(policy, controller, task), jax.random.key(seed)
         options = {"scored": scored, "chunk": chunk}
-        result |= benchmark(judged, plant, key, keys=keys, **options).as_dict()
-        if map is not None:
-            result["map"] = success_map(judged, plant, map, key, options)
-        if worst:
-            bounds = nominal_and_worst(plant)
-            result["worst"] = mildest_failure(plant, judged, bounds, key, samples=worst)
-    robustness_table(result, robot)
+        result |= _benchmarked(judged, task.plant, key, keys, map, worst, options)
+    robustness_table(result, board)
     if out is not None:
         from ..report.figures import write_robustness
 
@@ -189,45 +227,76 @@ def robustness(
     emit_json(result, json)
 
 
+def _benchmarked(
+    judged: "Controller",
+    plant: "Plant",
+    key: "jax.Array",
+    keys: int,
+    map: tuple[str, str] | None,
+    worst: int,
+    options: dict[str, Any],
+) -> dict[str, Any]:
+    """The report of the benchmark, and the map and the mildest failure that are asked for."""
+    from ..robustness import benchmark, nominal_and_worst, success_map
+    from ..sweep import mildest_failure
+
+    # The map comes first, since it refuses names that it does not know.
+    drawn = {} if map is None else {"map": success_map(judged, plant, map, key, options)}
+    result = benchmark(judged, plant, key, keys=keys, **options).as_dict() | drawn
+    if worst:
+        bounds = nominal_and_worst(plant)
+        result["worst"] = mildest_failure(plant, judged, bounds, key, samples=worst)
+    return result
+
+
 def leaderboard(
-    robot: str = "pendubot",
+    robot: Robot = "pendubot",
     controllers: str | None = None,
     policy: Path | None = None,
+    plant: str | None = None,
+    design: str | None = None,
     robustness: bool = True,
-    keys: int = 1,
-    seed: int = 0,
+    keys: Count = 3,
+    seed: Seed = 0,
     json: str | None = None,
     out: Path | None = None,
 ) -> None:
     """Judge controllers on performance and robustness, next to the published ones.
 
     Args:
-        robot: acrobot or pendubot.
+        robot: which joint is driven: the second of the acrobot, the first of the pendubot.
         controllers: names separated by commas; by default all that are known.
         policy: a policy or controller file to judge as well.
+        plant: YAML file of the parameters of another plant than that of the boards.
+        design: or an identified plant by name, such as C.1/1.0.
         robustness: run the robustness benchmark too (minutes for MPC).
-        keys: repetitions of what the benchmark draws at random.
+        keys: repetitions of what the benchmark draws at random; the median counts.
         seed: of the benchmark's first key.
         json: write the result as JSON to this file, or "-" for standard output.
         out: write the table as Markdown to this file.
     """
-    active_joint(robot)
+    check_file(json)
+    check_file(out)
     from .. import leaderboard as boards
-    from ..boards import v2
     from ..terminal import console
+    from .tables import leaderboard_table
 
-    chosen = boards.chosen(controllers, policy, robot)
-    say = lambda line: console.print(line, style="dim")  # noqa: E731
+    def say(line: str) -> None:
+        console.print(line, style="dim")
+
+    board, chosen = _board(robot, plant, design), boards.chosen(controllers, policy, robot)
     options = {"robustness": robustness, "keys": keys, "seed": seed}
-    board = boards.leaderboard(v2(robot), chosen, say=say, **options)
-    boards.show(board)
-    emit_json(board, json)
+    result = boards.leaderboard(board, chosen, say=say, **options)
+    result |= {"plant": plant, "design": design}
+    leaderboard_table(result, board)
+    emit_json(result, json)
     if out is not None:
-        write_atomically(out, boards.markdown(board))
+        write_atomically(out, boards.markdown(result))
 
 
 def optimise(
-    robot: Literal["acrobot", "pendubot"],
+    robot: Robot,
+    command: str,
     out: Path | None = None,
     json: str | None = None,
     search: Search = Search(),
@@ -235,11 +304,13 @@ def optimise(
     """Find the best swing-up and write its trajectory file.
 
     Args:
-        robot: which joint is driven.
+        robot: which joint is driven: the second of the acrobot, the first of the pendubot.
         out: trajectory file to write.
         json: report of all optima to write; "-" for standard output.
         search: how widely to look.
     """
+    check_file(out)
+    check_file(json)
     import jax
 
     from ..boards import v2
@@ -247,20 +318,18 @@ def optimise(
     from ..trajopt.search import find
 
     start = time.perf_counter()
-    say = lambda line: print(  # noqa: E731
-        f"[{time.perf_counter() - start:5.0f} s] {line}", file=sys.stderr, flush=True
-    )
+
+    def say(line: str) -> None:
+        print(f"[{time.perf_counter() - start:5.0f} s] {line}", file=sys.stderr, flush=True)
+
     with jax.enable_x64(True):
         found = find(v2(robot).task, search, say=say)
     for _, report in found:
         seconds, turns = report["criteria"]["swingup_time"], report["turns_of_theta2"]
         say(f"score {report['score']:.4f}, up after {seconds:.2f} s, turns of theta2 {turns:+d}")
     reference, report = found[0]
-    command = f"jaxpend optimise --robot {robot} --search.seed {search.seed}"
     if out is not None:
         save_reference(out, reference, {"command": command, **report})
         say(f"wrote {out}")
-    emit_json(
-        {"robot": robot, "search": dataclasses.asdict(search), "optima": [r for _, r in found]},
-        json,
-    )
+    optima = [report for _, report in found]
+    emit_json({"robot": robot, "search": dataclasses.asdict(search), "optima": optima}, json)

@@ -14,6 +14,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ..config_files import read_yaml
 from ..errors import JaxpendError, choose
 from ..plant import Plant
 from ..robots import ROBOTS, active_joint
@@ -27,6 +28,8 @@ __all__ = [
     "from_dict",
     "from_file",
     "load",
+    "parameters",
+    "read",
 ]
 
 _REQUIRED = ("m1", "m2", "l1", "l2", "r1", "r2", "I1", "I2")
@@ -102,16 +105,31 @@ def from_dict(
     return Plant(**arrays)
 
 
+def read(path: str | Path) -> dict[str, float]:
+    """Parameters as ``from_dict`` takes them, of a YAML (or JSON) file.
+
+    Raises ``JaxpendError`` if it cannot be read, or holds something else.
+    """
+    parameters = read_yaml(Path(path))
+    try:
+        from_dict(parameters)
+    except JaxpendError as error:
+        raise JaxpendError(f"{path}: {error}") from None
+    return dict(parameters)
+
+
 def from_file(path: str | Path, **kwargs) -> Plant:
     """``from_dict`` on a YAML (or JSON) file. Raises ``JaxpendError`` if it cannot be read."""
-    import yaml  # only users with files of their own pay for it
+    return from_dict(read(path), **kwargs)
 
-    try:
-        parameters = yaml.safe_load(Path(path).read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = getattr(error, "strerror", None) or "not valid YAML"
-        raise JaxpendError(f"cannot read plant parameters from {path}: {reason}") from None
-    return from_dict(parameters, **kwargs)
+
+def parameters(name: str) -> dict[str, float]:
+    """Parameters as ``from_dict`` takes them, of an identified set by name, such as "C.1/1.0".
+
+    Raises ``JaxpendError`` for an unknown name; the message lists the known ones.
+    """
+    design, model = choose("design", name, available()).split("/")
+    return _table()[design][model]
 
 
 def load(

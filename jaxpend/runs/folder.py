@@ -1,23 +1,20 @@
-"""Configurations in files and run folders on disk."""
+"""Run folders on disk."""
 
 import contextlib
-import dataclasses
 import fcntl
 import json
 import os
 import re
 import time
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
-from importlib import resources
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
-
-import yaml
+from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from . import tensorboard
+from ..config_files import differing_field, to_mapping
 from ..errors import JaxpendError
 from ..files import TEMPORARY, remove_temporary, to_json, write_atomically
 from .reader import read_result, seed_folders
@@ -25,90 +22,7 @@ from .reader import read_result, seed_folders
 if TYPE_CHECKING:
     from ..controller import Controller
 
-__all__ = [
-    "RunFolder",
-    "from_mapping",
-    "load_config",
-    "refuse_foreign",
-    "refuse_no_group",
-    "to_mapping",
-]
-
-T = TypeVar("T")
-
-
-def to_mapping(config: Any) -> dict:
-    """A configuration dataclass as plain nested dicts and lists, as YAML and JSON have them.
-
-    Infinities become text, since JSON has no number for them; ``from_mapping`` reads it back.
-    """
-    return json.loads(json.dumps(dataclasses.asdict(config)), parse_constant=str)
-
-
-def from_mapping(default: T, values: Any, where: str) -> T:
-    """``default`` with the fields named in a nested mapping replaced.
-
-    Raises:
-        JaxpendError: an unknown field, or a value of the wrong type; ``where`` names the source.
-    """
-    if not isinstance(values, dict):
-        raise JaxpendError(f"{where}: expected fields of {type(default).__name__}")
-    known = {f.name: getattr(default, f.name) for f in dataclasses.fields(default)}
-    changes = {}
-    for name, value in values.items():
-        if name not in known:
-            raise JaxpendError(f"{where}: unknown field {name!r}; known: {', '.join(known)}")
-        changes[name] = _converted(known[name], value, f"{where}: {name}")
-    return dataclasses.replace(default, **changes)
-
-
-def _converted(old: Any, value: Any, where: str) -> Any:
-    if dataclasses.is_dataclass(old):
-        return from_mapping(old, value, where)
-    if isinstance(old, tuple) and isinstance(value, list):
-        return tuple(value)
-    if isinstance(old, float) and isinstance(value, int | str) and not isinstance(value, bool):
-        # YAML takes 1e-3 for text, and the infinities of ``to_mapping`` are text.
-        with contextlib.suppress(ValueError):
-            return float(value)
-    if old is not None and type(value) is not type(old):
-        raise JaxpendError(f"{where}: {value!r} is not {type(old).__name__}")
-    return value
-
-
-def load_config(default: T, path: str | Path, also: Sequence[str] = ()) -> T:
-    """``default`` with what a YAML file says; sections in ``also`` may be there without a field.
-
-    ``path`` may be the name of a recipe that ships with the package: acrobot, pendubot or plain.
-
-    Raises:
-        JaxpendError: the file cannot be read, or names an unknown field or a bad value.
-    """
-    shipped = resources.files("jaxpend").joinpath(f"recipes/{path}.yaml")
-    file = shipped if shipped.is_file() else Path(path)
-    try:
-        values = yaml.safe_load(file.read_text())
-    except FileNotFoundError:
-        raise JaxpendError(f"there is no configuration file {path}") from None
-    except (UnicodeDecodeError, yaml.YAMLError):
-        raise JaxpendError(f"{path} is not valid YAML") from None
-    values = {} if values is None else values
-    if isinstance(values, dict):
-        values = {k: v for k, v in values.items() if k not in also or hasattr(default, k)}
-    return from_mapping(default, values, str(path))
-
-
-def differing_field(stored: Any, given: Any, ignored: Sequence[str] = ()) -> str | None:
-    """The first field, dotted, in which two configurations as plain dicts differ; None: in none."""
-    if not isinstance(stored, dict) or not isinstance(given, dict):
-        return None if stored == given else ""
-    for name in {**given, **stored}:
-        if name in ignored:
-            continue
-        inner = differing_field(stored.get(name), given.get(name))
-        if inner is not None:
-            return f"{name}.{inner}".rstrip(".")
-    return None
+__all__ = ["RunFolder", "refuse_foreign", "refuse_no_group"]
 
 
 def _field(values: Any, dotted: str) -> Any:

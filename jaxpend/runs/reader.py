@@ -28,7 +28,6 @@ __all__ = [
     "read_result",
     "read_run",
     "remarks",
-    "runs_table",
     "seed_folders",
 ]
 
@@ -303,12 +302,21 @@ def _locked(folder: Path) -> bool:
     return False
 
 
+def _changed(folder: Path) -> str:
+    """When a file in it was last written, as ISO 8601."""
+    times = [folder.stat().st_mtime]
+    with contextlib.suppress(OSError):
+        for path in folder.iterdir():
+            with contextlib.suppress(OSError):  # it is gone already
+                times.append(path.lstat().st_mtime)
+    newest = max(times[1:], default=times[0])
+    return datetime.datetime.fromtimestamp(newest).astimezone().isoformat(timespec="seconds")
+
+
 def _entry(folder: Path) -> dict[str, Any]:
     """One run folder as plain values; ``state`` is finished, running, interrupted or broken."""
-    about = {"run": folder.name, "robot": None, "stages": [], "seed": None, "state": "broken"}
-    newest = max((p.lstat().st_mtime for p in folder.iterdir()), default=0.0)
-    changed = datetime.datetime.fromtimestamp(newest).astimezone().isoformat(timespec="seconds")
-    about |= {"at": None, "score": None, "seconds": None, "changed": changed}
+    about: dict[str, Any] = {"run": folder.name, "robot": None, "stages": [], "seed": None, "state": "broken"}
+    about |= {"at": None, "score": None, "seconds": None, "changed": _changed(folder)}
     try:
         config = _config(folder)
         seed = config.get("seed")
@@ -369,31 +377,3 @@ def listing(folder: str | Path) -> list[dict[str, Any]]:
     if not entries:
         raise JaxpendError(f"there are no runs in {folder}; jaxpend train makes runs")
     return entries
-
-
-def runs_table(entries: Sequence[Mapping[str, Any]]) -> None:
-    """Print runs, a row each, on standard error like all tables."""
-    from rich import box
-    from rich.table import Table
-
-    from ..terminal import console
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("run", "robot", "stages", "seed", "state", "score", "time", "changed"):
-        right = heading in ("score", "time")
-        table.add_column(heading, justify="right" if right else "left", overflow="fold")
-    colours = {"finished": "green", "running": "cyan", "interrupted": "yellow", "broken": "red"}
-    for run in entries:
-        seed = f"{len(run['seed'])} seeds" if "runs" in run else run["seed"]
-        state = f"[{colours[run['state']]}]{run['state']}[/]"
-        table.add_row(
-            run["run"], run["robot"] or "", ", ".join(s.upper() for s in run["stages"]),
-            "" if seed is None else str(seed),
-            f"{state}: {run['at']}" if run["at"] else state,
-            "" if run["score"] is None else f"{run['score']:.4f}",
-            "" if run["seconds"] is None else f"{run['seconds']:.0f} s",
-            datetime.datetime.fromisoformat(run["changed"]).strftime("%d %b %H:%M"),
-        )  # fmt: skip
-    console.print(table)
-    if any("runs" in run for run in entries):
-        console.print("the score of several seeds is the median of those finished", style="dim")

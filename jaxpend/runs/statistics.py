@@ -4,11 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 __all__ = ["interquartile_mean", "interval", "summary"]
 
 
-def interquartile_mean(values: np.ndarray) -> np.ndarray:
+def interquartile_mean(values: ArrayLike) -> np.ndarray:
     """Mean of the middle half of the seeds, which come first: (seeds, ...) -> (...).
 
     Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice", 2021.
@@ -18,7 +19,9 @@ def interquartile_mean(values: np.ndarray) -> np.ndarray:
     return trim_mean(np.asarray(values, float), 0.25, axis=0)
 
 
-def interval(values: np.ndarray, level: float = 0.95, resamples: int = 2000, seed: int = 0):
+def interval(
+    values: ArrayLike, level: float = 0.95, resamples: int = 2000, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Percentile bootstrap interval of the interquartile mean over seeds.
 
     Args:

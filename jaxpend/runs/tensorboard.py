@@ -46,7 +46,7 @@ class Events:
         self._writer = EventsWriter(str(folder / "events"), SUFFIX)
         weakref.finalize(self, self._writer.close)
         for line in (run / "metrics.jsonl").read_text().splitlines():
-            with contextlib.suppress(ValueError):
+            with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError):  # no row
                 self.add(json.loads(line))
 
     def add(self, row: Mapping[str, Any]) -> None:

@@ -1,13 +1,14 @@
 """The stages of ``jaxpend sac``: imitation of demonstrations, and SAC itself."""
 
 from functools import partial
+from typing import Any, Self
 
 import jax
 
 from ..boards import Task
-from ..config import SACConfig
+from ..config import Run, SACConfig
 from ..controller import Controller
-from ..pytree import pytree
+from ..pytree import Pytree, pytree
 from ..score import nominal
 from ..stage import Chart, Stage
 from . import algorithm
@@ -18,7 +19,7 @@ __all__ = ["SAC", "Imitation", "ImitationState"]
 
 
 @pytree
-class ImitationState:
+class ImitationState(Pytree):
     """SAC before its first step, and the actor that imitates."""
 
     sac: SACState
@@ -32,27 +33,32 @@ class Imitation(Stage[None, ImitationState, SACState]):
     charts = (Chart("Squared error", {"loss": "loss"}, "of the action", True),)
     CHUNK = 2000  # updates
 
-    def __init__(self, config: SACConfig):
-        self.config, self.total = config, config.demonstrations.updates
+    def __init__(self, config: SACConfig, task: Task):
+        self.config, self.task, self.total = config, task, config.demonstrations.updates
 
     @classmethod
-    def of(cls, run, start, task):
+    def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
         config = getattr(run, "sac", None)
-        return cls(config) if config and config.demonstrations.episodes else None
+        return cls(config, task) if config and config.demonstrations.episodes else None
 
-    def start(self, seed, before):
-        return ImitationState(*algorithm.begin(self.config, jax.random.key(seed)))
+    def start(self, seed: int, before: None) -> ImitationState:
+        return self._state(*algorithm.begin(self.config, jax.random.key(seed)))
 
-    def like(self):
-        return ImitationState(*algorithm.structure(self.config))
+    def like(self) -> ImitationState:
+        return self._state(*algorithm.structure(self.config))
 
-    def policy_like(self):
+    @staticmethod
+    def _state(state: SACState, learner: Learner | None) -> ImitationState:
+        assert learner is not None  # there are demonstrations: ``of``
+        return ImitationState(state, learner)
+
+    def policy_like(self) -> Controller | None:
         return None
 
-    def done(self, state):
+    def done(self, state: ImitationState) -> int:
         return int(state.learner.done)
 
-    def advance(self, states):
+    def advance(self, states: list[ImitationState]) -> list[tuple[ImitationState, dict[str, Any]]]:
         count = min(self.CHUNK, self.total - self.done(states[0]))
         after = []
         for state in states:
@@ -60,20 +66,22 @@ class Imitation(Stage[None, ImitationState, SACState]):
             after.append((state.replace(learner=learner), {"loss": loss}))
         return after
 
-    def judge(self, state, metrics):
+    def judge(
+        self, state: ImitationState, metrics: dict[str, Any]
+    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
         return metrics, []
 
-    def note(self, row):
+    def note(self, row: dict[str, Any]) -> str:
         return f"loss {float(row['loss']):.5f}"
 
-    def watched(self, state):
+    def watched(self, state: ImitationState) -> Any:
         return state.learner.params, state.learner.opt_state
 
-    def rekey(self, state, number):
+    def rekey(self, state: ImitationState, number: int) -> ImitationState:
         key = jax.random.fold_in(state.learner.key, number)
         return state.replace(learner=state.learner.replace(key=key))
 
-    def outcome(self, state, best):
+    def outcome(self, state: ImitationState, best: Controller | None) -> SACState:
         return state.sac.replace(actor=state.learner.params)
 
 
@@ -97,25 +105,25 @@ class SAC(Stage[SACState | None, SACState, Controller]):
         self.vector_steps = max(config.eval_every // config.num_envs, 1)
 
     @classmethod
-    def of(cls, run, start, task):
+    def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
         config = getattr(run, "sac", None)
         return cls(config, task) if config else None
 
-    def start(self, seed, before):
+    def start(self, seed: int, before: SACState | None) -> SACState:
         if before is not None:
             return before
         return algorithm.begin(self.config, jax.random.key(seed))[0]
 
-    def like(self):
+    def like(self) -> SACState:
         return algorithm.structure(self.config)[0]
 
-    def policy_like(self):
+    def policy_like(self) -> Controller | None:
         return jax.eval_shape(partial(algorithm.greedy_policy, self.config), self.like())
 
-    def done(self, state):
+    def done(self, state: SACState) -> int:
         return int(state.env_steps)
 
-    def advance(self, states):
+    def advance(self, states: list[SACState]) -> list[tuple[SACState, dict[str, Any]]]:
         # The last chunk is as long as what is left, in whole steps of all environments.
         left = -(-(self.total - self.done(states[0])) // self.config.num_envs)
         steps = min(self.vector_steps, left)
@@ -123,21 +131,24 @@ class SAC(Stage[SACState | None, SACState, Controller]):
             return [algorithm.train_chunk(self.config, states[0], steps)]
         return algorithm.train_chunks(self.config, states, steps)
 
-    def judge(self, state, metrics):
+    def judge(
+        self, state: SACState, metrics: dict[str, Any]
+    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
         policy = algorithm.greedy_policy(self.config, state)
         c = nominal(policy, self.task)
         score = float(self.task.score(c))
         row = {"updates": int(state.updates), "score": score, "uptime": c.uptime, **metrics}
         return row, [(policy, score)]
 
-    def note(self, row):
+    def note(self, row: dict[str, Any]) -> str:
         return f"reward {float(row['reward']):.2f}  score {row['score']:.3f}"
 
-    def watched(self, state):
+    def watched(self, state: SACState) -> Any:
         return state.replace(demonstrations=None)
 
-    def rekey(self, state, number):
+    def rekey(self, state: SACState, number: int) -> SACState:
         return state.replace(key=jax.random.fold_in(state.key, number))
 
-    def outcome(self, state, best):
+    def outcome(self, state: SACState, best: Controller | None) -> Controller:
+        assert best is not None
         return best

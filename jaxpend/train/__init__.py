@@ -1,5 +1,5 @@
 """The loop that takes runs through the stages of training."""
 
-from .loop import execute, train
+from .loop import train
 
-__all__ = ["execute", "train"]
+__all__ = ["train"]

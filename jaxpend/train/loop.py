@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..boards import Board, Task, v2
+from ..boards import Board, Task, task_of
 from ..config import GradientRun, Run, SNESRun
 from ..controller import Controller
 from ..controllers.catalogue import find_controller
@@ -18,16 +18,15 @@ from ..gradient import Gradient
 from ..runs.checkpoints import Checkpoints
 from ..runs.folder import RunFolder, refuse_foreign, refuse_no_group
 from ..runs.reader import read_run
-from ..runs.seeds import seeds_table
 from ..runs.statistics import summary
 from ..sac.stage import SAC, Imitation
 from ..snes import SNES
 from ..stage import Stage
-from ..terminal import LiveProgress, console, score_table
+from ..terminal import LiveProgress, console
 from .interrupt import Stopped, deferred, stop_if_asked
 from .seed_run import SeedRun
 
-__all__ = ["STAGES", "execute", "stages_of", "train"]
+__all__ = ["STAGES", "stages_of", "train"]
 
 # The stages that there are, in their order. A configuration has those for which ``Stage.of`` says
 # so; nothing else in the program knows them by name.
@@ -96,11 +95,6 @@ def stages_of(
     return stages
 
 
-def task_of(config: Run) -> Task:
-    """The task of a configuration."""
-    return v2(config.robot).task
-
-
 def open_runs(config: Run, command: str, about: Mapping[str, Any]) -> Iterator[RunFolder]:
     """The run folders of all seeds. Before the first is made, none of them may be foreign."""
     seeds = config.of_seeds()
@@ -130,7 +124,7 @@ def train(
         JaxpendError: the folder cannot be used or written, or training diverged.
         Stopped: a signal asked for it, and everything is on disk.
     """
-    task, start = task_of(config), None
+    task, start = task_of(config.robot, config.plant, config.design), None
     if isinstance(config, GradientRun | SNESRun):
         # Before the folder is made: a wrong file leaves nothing behind.
         start = find_controller(config.policy, config.controller, task)
@@ -144,11 +138,13 @@ def train(
             opened.enter_context(folder)
             checkpoints = Checkpoints(folder.path / "checkpoints", one.checkpoint.keep)
             runs.append(SeedRun(one, folder, checkpoints, Board("v2", task), start))
-        waiting = [run for run in runs if run.folder.result is None]
+        waiting = []
         for run in runs:
-            if run not in waiting:
-                score = run.folder.result["score"]
-                console.print(f"{run.folder.path} is finished: score {score:.4f}", soft_wrap=True)
+            if (result := run.folder.result) is None:
+                waiting.append(run)
+                continue
+            text = f"{run.folder.path} is finished: score {result['score']:.4f}"
+            console.print(text, soft_wrap=True)
         try:
             with deferred():
                 for group in [waiting] if vmap else [[run] for run in waiting]:
@@ -188,13 +184,3 @@ def train_group(runs: Sequence[SeedRun], stages: Mapping[str, Stage]) -> None:
     for run in runs:
         if not run.failed:
             run.finish()
-
-
-def execute(config: Run, command: str) -> None:
-    """``train``, the score table, and where the results are."""
-    result = train(config, command)
-    if config.seeds > 1:
-        seeds_table(result)
-    else:
-        score_table(read_run(config.folder).results, config.robot)
-    console.print(f"policy.npz, metrics and result are in [bold]{config.folder}[/bold]")

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from ..boards import Board
 from ..config import Run
 from ..controller import Controller
+from ..pytree import Pytree
 from ..runs.checkpoints import Checkpoints
 from ..runs.folder import RunFolder
 from ..score import official
@@ -30,7 +31,7 @@ class SeedRun:
     board: Board
     start: Controller | None = None  # what a user has it start from
     stage: str = ""  # name of the stage it is in
-    state: Any = None  # of the stage it is in: its ``State``
+    state: Pytree | None = None  # of the stage it is in: its ``State``
     outcome: Any = None  # of the stage before, for the next one: its ``After``
     best: Controller | None = None  # by the official score; None in a stage without policies
     best_score: float = -math.inf
@@ -86,10 +87,11 @@ class SeedRun:
         """Begin a stage with what the one before it came to."""
         before = self.start if self.outcome is None else self.outcome
         self.state = stage.start(self.config.seed, before)
+        self.outcome = None  # with its replay buffer
         self.stage, self.best, self.best_score, self.best_at = stage.name, None, -math.inf, 0
         row, candidates = stage.judge(self.state, {})
         self._keep_best(stage, candidates)
-        if "score" in row:
+        if "score" in row:  # a point to begin the curves with
             self.folder.log(stage.name, **{stage.column: stage.done(self.state)}, **row)
 
     def take(self, stage: Stage, state: Any, metrics: dict) -> dict:
@@ -131,6 +133,7 @@ class SeedRun:
                 self._save_best(stage)
 
     def _save_best(self, stage: Stage) -> None:
+        assert self.best is not None
         self._save(f"{stage.name}_best.npz", self.best, stage, self.best_at)
 
     def _save(self, name: str, policy: Controller, stage: Stage, at: int) -> None:
@@ -150,6 +153,7 @@ class SeedRun:
 
     def finish(self) -> None:
         """All stages are done: the policy and the result; the checkpoints have done their job."""
+        assert self.best is not None
         score = self.result["score"]
         self.folder.save("policy.npz", self.best, seed=self.config.seed, score=score)
         self.folder.write_json("result.json", self.result)

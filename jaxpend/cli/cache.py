@@ -1,0 +1,72 @@
+"""How jax is set up before a command computes: kept programs, and the platform asked for."""
+
+import os
+import sys
+import warnings
+from pathlib import Path
+
+from ..errors import JaxpendError
+from ..fields import OFF, ON
+
+__all__ = ["VARIABLE", "cache_folder", "check_platform", "compile_cache"]
+
+VARIABLE = "JAXPEND_CACHE"
+
+
+def cache_folder() -> Path | None:
+    """Where to keep compiled programs; None: nowhere, or the user has told jax already."""
+    said = os.environ.get(VARIABLE, "")
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ or said.lower() in OFF:
+        return None
+    if said and said.lower() not in ON:
+        return Path(said).expanduser()
+    # The XDG specification: a relative path is invalid and ignored.
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    base = base if base.is_absolute() else Path("~/.cache").expanduser()
+    return base / "jaxpend" / "xla"
+
+
+def compile_cache() -> None:
+    """Keep compiled programs for the next start. The one place that configures jax and XLA.
+
+    What the environment says already has the last word. A folder that cannot be written is passed
+    over, since nothing depends on it.
+    """
+    try:
+        folder = cache_folder()
+        if folder is None:
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            return
+    except (OSError, RuntimeError):  # RuntimeError: there is no home
+        return
+    # XLA complains on every load on some CPUs, where it takes tuning hints for instructions.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    warnings.filterwarnings("ignore", message=".*persistent compilation cache")
+    settings = {
+        "jax_compilation_cache_dir": str(folder),
+        "jax_persistent_cache_min_compile_time_secs": 0.2,  # less is not worth a file
+    }
+    for name, value in settings.items():
+        if name.upper() not in os.environ:
+            os.environ[name.upper()] = str(value)
+            if "jax" in sys.modules:  # python -m jaxpend.X: it has read its environment already
+                sys.modules["jax"].config.update(name, value)
+
+
+def check_platform() -> None:
+    """Raise ``JaxpendError`` for a platform in the environment that jax does not have here.
+
+    Unasked, jax would say so in the middle of whatever is the first to compute.
+    """
+    for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
+        if os.environ.get(name):
+            import jax
+
+            try:
+                jax.devices()
+            except RuntimeError as error:
+                said = (str(error).strip() or "no reason given").splitlines()[0]
+                text = f"{name} is {os.environ[name]!r}, which jax cannot use here: {said}"
+                raise JaxpendError(text) from None

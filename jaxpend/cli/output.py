@@ -1,0 +1,65 @@
+"""What commands write: JSON, and where it may go."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from ..errors import JaxpendError
+from ..files import to_json, write_atomically
+
+__all__ = ["check_file", "check_folder", "drop_unwritable", "emit_json"]
+
+
+def emit_json(value: Any, target: str | Path | None) -> None:
+    """Write ``value`` as JSON to standard output ("-") or, atomically, to a file; None: nowhere."""
+    if target is None:
+        return
+    text = to_json(value, indent=2) + "\n"
+    if str(target) != "-":
+        write_atomically(target, text)
+        return
+    check_file("-")
+    sys.stdout.write(text)
+
+
+def check_file(path: str | Path | None) -> None:
+    """Raise ``JaxpendError`` if a file could not be written; None and "-" are as in ``emit_json``.
+
+    Commands ask before they compute, so that a mistyped name does not cost minutes.
+    """
+    if path is None:
+        return
+    if str(path) == "-":
+        if sys.stdout is None:
+            raise JaxpendError("standard output is closed; name a file instead of -")
+        return
+    if Path(path).is_dir():
+        raise JaxpendError(f"cannot write {path}: it is a folder")
+    check_folder(Path(path).parent)
+
+
+def check_folder(path: str | Path | None) -> None:
+    """Raise ``JaxpendError`` if no file could be written into a folder, made where it is not."""
+    if path is None:
+        return
+    there = Path(path)
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir():
+        raise JaxpendError(f"cannot write into {path}: {there} is not a folder")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise JaxpendError(f"cannot write into {path}: {there} is not writable")
+
+
+def drop_unwritable() -> None:
+    """Let what a closed pipe or a full disk does not take go nowhere.
+
+    Python would try again when it shuts down, and print that it failed.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            if stream is not None:
+                stream.flush()
+        except (OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
