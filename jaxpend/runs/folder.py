@@ -7,7 +7,7 @@ import os
 import re
 import time
 import weakref
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,6 +63,22 @@ def refuse_no_group(path: Path) -> None:
         raise JaxpendError(text)
 
 
+def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Fields of nested mappings, dotted, with their values."""
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
+
+
+def changed(config: Any) -> dict[str, list[Any]]:
+    """Fields of a run's configuration, dotted, that are not as by default: value and default."""
+    same = {"robot": config.robot} if hasattr(config, "robot") else {}
+    default, given = (dict(_flat(to_mapping(c))) for c in (type(config)(**same), config))
+    return {k: [v, default.get(k)] for k, v in given.items() if k not in default or v != default[k]}
+
+
 def _read(path: Path) -> dict[str, Any]:
     """What a JSON file says; nothing if it is not there."""
     try:
@@ -79,9 +95,10 @@ def _read(path: Path) -> dict[str, Any]:
 class RunFolder:
     """Where a run leaves its configuration, metrics, policies and result.
 
-    ``config.json``, ``run.json`` (version, command, and what it is ``about``: its stages, its
-    plant), ``metrics.jsonl`` (one row an evaluation), ``*.npz`` policies, ``checkpoints`` while it
-    is not finished and, at the end, ``result.json``. All but the metrics are written atomically.
+    ``config.json``, ``run.json`` (version, command, what differs from the defaults, and what it is
+    ``about``: its stages, its plant), ``metrics.jsonl`` (one row an evaluation), ``*.npz``
+    policies, ``checkpoints`` while it is not finished and, at the end, ``result.json``. All but
+    the metrics are written atomically.
 
     A new folder is made; one with a run of the same configuration is taken up again. As long as
     this object is open, no other process can open a run in the folder that is not finished.
@@ -109,7 +126,8 @@ class RunFolder:
             remove_temporary(self.path)
         if not (self.path / "config.json").exists():
             made_by = {"version": __version__, "jax": version("jax"), "command": command}
-            self.write_json("run.json", {**made_by, "stages": [], **self.about})
+            about = {"stages": [], "changed": changed(config), **self.about}
+            self.write_json("run.json", {**made_by, **about})
             self.write_json("config.json", self.config)  # last: it says that a run is here
 
     def _check(self) -> None:

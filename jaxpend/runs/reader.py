@@ -10,7 +10,6 @@ import dataclasses
 import datetime
 import fcntl
 import json
-import math
 import os
 import re
 import statistics
@@ -58,7 +57,7 @@ class RunRecord:
     rows: list[dict[str, Any]]  # of metrics.jsonl, numbers only, in the order of the stages
     result: dict[str, Any] | None  # None: not finished
     policy: str | None  # path, or robot for what ships with the package; None: none yet
-    made_by: dict[str, Any] = dataclasses.field(default_factory=dict)  # command and version
+    made_by: dict[str, Any] = dataclasses.field(default_factory=dict)  # see ``_made_by``
 
     @property
     def progress(self) -> dict[str, tuple[int, int]]:
@@ -105,7 +104,7 @@ def _json(path: Path) -> Any:
 def _number(value: Any) -> bool:
     """Whether it is a number that can be shown and drawn."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_number and abs(value) < 1e300 and math.isfinite(value)
+    return is_number and abs(value) < 1e300  # which NaN is not
 
 
 def _is(value: Any, *kinds: type) -> Any:
@@ -205,6 +204,14 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def _made_by(said: Any) -> dict[str, Any]:
+    """Texts (command, version), the ``plant``, and what is ``changed``: name -> value, default."""
+    plant, changed = (_is(_is(said, dict).get(k, {}), dict) for k in ("plant", "changed"))
+    if not all(map(_number, plant.values())) or any(len(pair) != 2 for pair in changed.values()):
+        raise TypeError
+    return {k: v for k, v in said.items() if isinstance(v, str) or k in ("plant", "changed")}
+
+
 def read_run(folder: Path) -> RunRecord:
     """A run folder.
 
@@ -212,11 +219,10 @@ def read_run(folder: Path) -> RunRecord:
         JaxpendError: a file in it is not what it should be.
     """
     config, rows, path = _config(folder), _rows(folder / "metrics.jsonl"), folder / "run.json"
-    made_by = {} if (made_by := _json(path)) is None else made_by
+    said = {} if (said := _json(path)) is None else said
     try:
-        stated = _is(made_by, dict).get("stages")
-        made_by = {k: v for k, v in made_by.items() if isinstance(v, str)}
-        stages = _guessed(config, rows) if stated is None else [_stage(s) for s in _is(stated, list)]
+        made_by, told = _made_by(said), said.get("stages")
+        stages = _guessed(config, rows) if told is None else [_stage(s) for s in _is(told, list)]
     except (TypeError, KeyError, ValueError):
         raise _Unreadable(path, "what a run says of itself") from None
     order = {stage.name: (k, stage.column) for k, stage in enumerate(stages)}
@@ -240,7 +246,7 @@ def read_run(folder: Path) -> RunRecord:
 
 def seed_folders(folder: Path) -> list[Path]:
     """The runs of a group of seeds, in the order of the seeds."""
-    parts = [path.parent for path in folder.glob("seed*/config.json")]
+    parts = (path.parent for path in folder.glob("seed*/config.json"))
     return sorted(parts, key=lambda p: (len(p.name), p.name))
 
 
@@ -277,8 +283,8 @@ def remarks(runs: Sequence[RunRecord]) -> list[str]:
             diverged = any(row.get("finite") == 0 for row in run.rows)
             sentences.append(f"{run.name} is not finished{' and diverged' * diverged}: {where}.")
         if back := max((row.get("rollbacks", 0) for row in run.rows), default=0):
-            times = f"{back} time{'s' * (back > 1)}"
-            sentences.append(f"{run.name} diverged and went back to its last good state {times}.")
+            text = f"{run.name} diverged and went back to its last good state {back} time"
+            sentences.append(f"{text}{'s' * (back > 1)}.")
     return sentences
 
 
@@ -323,10 +329,8 @@ def _entry(folder: Path) -> dict[str, Any]:
     about["seconds"] = last.get("seconds")
     if run.result is not None:
         return about | {"state": "finished", "score": run.result["score"]}
-    at = "the start"
-    for stage in run.stages:
-        if stage.name == last.get("stage"):
-            at = f"{stage.title} {last[stage.column]:,}/{stage.total:,}"
+    here = [stage for stage in run.stages if stage.name == last.get("stage")]
+    at = f"{here[0].title} {last[here[0].column]:,}/{here[0].total:,}" if here else "the start"
     return about | {"state": "running" if _locked(folder) else "interrupted", "at": at}
 
 
