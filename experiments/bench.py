@@ -23,8 +23,9 @@ from jaxpend.config_files import load_config
 from jaxpend.controllers import Policy
 from jaxpend.controllers.catalogue import build
 from jaxpend.observation import Observation
+from jaxpend.sac.stage import SAC
 from jaxpend.score import performance, score_v2
-from jaxpend.train.stages import SAC, SNES
+from jaxpend.snes import SNES
 
 
 def random_policy(width: int) -> Policy:
@@ -62,9 +63,9 @@ def bench_seeds(count: int = 4) -> None:
     # Imitation is not timed: a few demonstrations will do.
     shown = dataclasses.replace(recipe.sac.demonstrations, episodes=20, updates=1)
     config = dataclasses.replace(recipe.sac, demonstrations=shown, eval_every=3200)
-    search = SNES(dataclasses.replace(recipe.snes, chunk=2), random_policy(64), recipe.robot)
-    agent = sac.Agent(config, v2(recipe.robot).task)
-    training = SAC(config, agent.task)
+    task = v2(recipe.robot).task
+    search = SNES(dataclasses.replace(recipe.snes, chunk=2), random_policy(64), task)
+    agent, training = sac.Agent(config, task), SAC(config, task)
     keys = [jax.random.key(seed) for seed in range(count)]
     parts = {
         "SAC": (training, [sac.init(agent, key) for key in keys]),
