@@ -13,7 +13,7 @@ $(error ROBOT is '$(ROBOT)'; it must be acrobot or pendubot)
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help install train snes score robustness leaderboard runs report test lint bench clean
+.PHONY: help install train snes score robustness leaderboard runs report docs test lint bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -50,6 +50,9 @@ runs: $(STAMP)  ## list the runs with their state and scores
 
 report: $(STAMP)  ## one page about the run RUN, with pictures
 	$(BIN)/jaxpend report runs/$(RUN) $(ARGS)
+
+docs: $(STAMP)  ## the reference: build/docs/index.html, from the docstrings
+	$(BIN)/python experiments/reference.py $(ARGS)
 
 test: $(STAMP)  ## the test suite
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)

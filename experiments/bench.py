@@ -17,13 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxpend import Scenario, designs, sac, snes
+from jaxpend.boards import v2
 from jaxpend.config import TrainRun
 from jaxpend.config_files import load_config
 from jaxpend.controllers import Policy
 from jaxpend.controllers.catalogue import build
 from jaxpend.observation import Observation
+from jaxpend.sac.stage import SAC
 from jaxpend.score import performance, score_v2
-from jaxpend.train.stages import SAC, SNES
+from jaxpend.snes import SNES
 
 
 def random_policy(width: int) -> Policy:
@@ -61,11 +63,12 @@ def bench_seeds(count: int = 4) -> None:
     # Imitation is not timed: a few demonstrations will do.
     shown = dataclasses.replace(recipe.sac.demonstrations, episodes=20, updates=1)
     config = dataclasses.replace(recipe.sac, demonstrations=shown, eval_every=3200)
-    search = SNES(dataclasses.replace(recipe.snes, chunk=2), random_policy(64), recipe.robot)
-    training = SAC(config)
+    task = v2(recipe.robot).task
+    search = SNES(dataclasses.replace(recipe.snes, chunk=2), random_policy(64), task)
+    agent, training = sac.Agent(config, task), SAC(config, task)
     keys = [jax.random.key(seed) for seed in range(count)]
     parts = {
-        "SAC": (training, [sac.init(config, key) for key in keys]),
+        "SAC": (training, [sac.init(agent, key) for key in keys]),
         "SNES": (search, [search.start(seed, random_policy(64)) for seed in range(count)]),
     }
     for name, (stage, states) in parts.items():
@@ -110,12 +113,13 @@ def bench_mpc() -> None:
 def bench_sac() -> None:
     """Updates and steps of SAC."""
     config = sac.SACConfig(warmup_steps=0)
-    state = sac.init(config, jax.random.key(0))
+    agent = sac.Agent(config, v2("pendubot").task)
+    state = sac.init(agent, jax.random.key(0))
     vector_steps = 250
 
     def chunk():
         nonlocal state
-        state, metrics = sac.train_chunk(config, state, vector_steps)
+        state, metrics = sac.train_chunk(agent, state, vector_steps)
         return metrics
 
     times = timed(chunk)

@@ -9,14 +9,11 @@ front.png: a controller on the line is beaten in both by no other that was measu
 import json
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
-from jaxpend import cli, designs
-from jaxpend.boards import PUBLISHED
+from jaxpend import cli
+from jaxpend.boards import V2, v2
 
 HERE = Path(__file__).parent
 # Okabe and Ito's palette: told apart by the colour-blind too.
@@ -31,7 +28,7 @@ STYLE = {
 
 def points(robot: str) -> list[tuple[str, str, float, float]]:
     """(kind, label, performance, robustness) of all there is."""
-    found = [("published", name, *pair) for name, pair in PUBLISHED[robot].items()]
+    found: list[tuple[str, str, float, float]] = [("published", *r) for r in v2(robot).published]
     rows = json.loads((HERE / "leaderboard.json").read_text())[robot]["rows"]
     for row in rows:
         ours = row["source"] == "measured" and not row["name"].startswith("policy")
@@ -80,9 +77,10 @@ def draw(axis, found: list[tuple], labelled: str) -> None:
 
 def main(out: Path = HERE / "front.png") -> None:
     """Draw the front of both robots, whole and its upper right corner."""
-    figure, axes = plt.subplots(2, 2, figsize=(10, 9), layout="constrained")
+    figure = Figure(figsize=(10, 9), layout="constrained")
+    axes = figure.subplots(2, 2)
     corners = {"acrobot": (0.706, 0.719), "pendubot": (0.6945, 0.7035)}
-    for column, robot in enumerate(designs.ROBOTS):
+    for column, robot in enumerate(V2):
         whole, corner = axes[:, column]
         found = points(robot)
         draw(whole, found, "published")

@@ -31,15 +31,17 @@ import jax
 import numpy as np
 
 from jaxpend import designs, leaderboard, load_policy
+from jaxpend.boards import v2
 from jaxpend.cli import emit_json
 from jaxpend.config import STRATEGIES, GradientConfig, SACRun, SNESConfig
 from jaxpend.config_files import load_config
 from jaxpend.controllers import guard
 from jaxpend.files import write_atomically
+from jaxpend.gradient import Gradient
+from jaxpend.snes import SNES
 from jaxpend.sweep import sweep
 from jaxpend.terminal import console
 from jaxpend.train.loop import train
-from jaxpend.train.stages import SNES, Gradient
 from jaxpend.variations import sample
 
 HERE = Path(__file__).parent
@@ -87,12 +89,13 @@ def start_of(kind: str, robot: str, seed: int, runs: Path):
 def stage_of(method: str, size: float, share: float, robot: str, policy, **options):
     """The stage of ``jaxpend train`` that a method is, with a step size; ``share`` of schedules."""
     method, options = method.split(",")[0], options | {"searched": "weights"}
+    task = v2(robot).task
     if method == "gradient":
-        return Gradient(GradientConfig(round(share * STEPS), size, **options), policy, robot)
+        return Gradient(GradientConfig(round(share * STEPS), size, **options), policy, task)
     # Without a schedule, until the time is over.
     generations = round(share * GENERATIONS) if "final_sigma" in options else 10**6
     options |= {"generations": generations, "action_noise": 0.0}
-    return SNES(SNESConfig(method, sigma=size, **options), policy, robot)
+    return SNES(SNESConfig(method, sigma=size, **options), policy, task)
 
 
 def climb(stage, start, seed: int, seconds: float):

@@ -2,6 +2,7 @@
 
 import io
 import json
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,16 +10,18 @@ from typing import Any
 import numpy as np
 
 from .errors import JaxpendError
-from .files import write_atomically
+from .files import replacing
 
 __all__ = ["read_arrays", "write_arrays"]
 
 
-def write_arrays(path: str | Path, header: dict[str, Any], arrays: Mapping[str, Any]) -> None:
+def write_arrays(
+    path: str | Path, header: dict[str, Any], arrays: Mapping[str, Any], *, compressed: bool = True
+) -> None:
     """Write a file of named arrays and a header that JSON can hold, atomically."""
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, header=np.array(json.dumps(header)), **arrays)
-    write_atomically(path, buffer.getvalue())
+    save = np.savez_compressed if compressed else np.savez
+    with replacing(path) as file:
+        save(file, header=np.array(json.dumps(header)), **arrays)
 
 
 def read_arrays(path: Path, what: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -28,8 +31,12 @@ def read_arrays(path: Path, what: str) -> tuple[dict[str, Any], dict[str, np.nda
         JaxpendError: no such file, or not one that ``write_arrays`` wrote.
     """
     try:
-        # Read whole first: numpy leaves a broken file open.
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+        content = io.BytesIO(path.read_bytes())  # whole: numpy leaves a broken file open
+        with zipfile.ZipFile(content) as file:
+            if file.testzip() is not None:  # a checksum that numpy may not come to read
+                raise zipfile.BadZipFile
+        content.seek(0)
+        with np.load(content, allow_pickle=False) as file:
             arrays = dict(file)
         header = json.loads(str(arrays.pop("header")))
     except FileNotFoundError:

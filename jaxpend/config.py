@@ -25,6 +25,7 @@ from .fields import (
 from .observation import Observation
 
 __all__ = [
+    "LINES",
     "CheckpointConfig",
     "DemonstrationConfig",
     "EnvConfig",

@@ -1,12 +1,17 @@
 """Writing files so that no reader, and no crash, ever sees half of one; strict JSON for them."""
 
+import contextlib
 import json
 import math
 import os
+import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
-__all__ = ["to_json", "write_atomically"]
+__all__ = ["TEMPORARY", "remove_temporary", "replacing", "to_json", "write_atomically"]
+
+TEMPORARY = re.compile(r"\..+\.jaxpend-tmp-\d+")  # names of files that are not finished
 
 
 def _plain(value: Any) -> Any:
@@ -24,13 +29,32 @@ def to_json(value: Any, indent: int | None = None) -> str:
     return json.dumps(_plain(value), indent=indent, allow_nan=False)
 
 
-def write_atomically(path: str | Path, content: bytes | str) -> None:
-    """Replace a file in one step: a reader, or a crash, sees the old content or the new, whole."""
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[BinaryIO]:
+    """A file to write, which takes the place of ``path`` in one step when all went well.
+
+    A reader, or a crash, sees the old content or the new, whole. What a killed process leaves
+    has a name that ``TEMPORARY`` matches and nothing else has.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = path.with_name(f".{path.name}.jaxpend-tmp-{os.getpid()}")
     try:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        with temporary.open("wb") as file:
+            yield file
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_atomically(path: str | Path, content: bytes | str) -> None:
+    """Replace a file as ``replacing`` does."""
+    with replacing(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+def remove_temporary(folder: Path) -> None:
+    """Remove what processes that were killed in ``replacing`` have left in a folder."""
+    for path in folder.iterdir():
+        if TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)

@@ -18,7 +18,7 @@ ones fades from the gradient (``memory``).
 
 import math
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -26,18 +26,19 @@ import numpy as np
 import optax
 
 from .boards import Task, own_task
-from .config import GradientConfig
+from .config import GradientConfig, Run
 from .controller import Controller, check_controller
-from .controllers.search_space import coordinates
+from .controllers.search_space import coordinates, kinds
 from .criteria import EPSILON
 from .plant import rk4_step
 from .pytree import Pytree, pytree
 from .rollout import rollout
 from .scenario import Scenario
+from .stage import Chart, SearchStage, SearchState
 from .trajopt.swingup import SwingUp, smooth_score, totals
 from .variations import LONGEST_DELAY
 
-__all__ = ["GradientConfig", "GradientState", "current", "improve", "init", "slope"]
+__all__ = ["Gradient", "GradientConfig", "GradientState", "current", "improve", "init", "slope"]
 
 
 @pytree
@@ -166,6 +167,63 @@ def improve(
 def current(config: GradientConfig, start: Controller, state: GradientState) -> Controller:
     """The controller where the ascent is."""
     return coordinates(start, config.searched)[-1](state.parameters)
+
+
+class Gradient(SearchStage):
+    """The stage of training: the ascent; what is judged, by ``stage.value``, is where it is."""
+
+    name, title, unit, column = "gradient", "Gradient", "steps", "step"
+    heading, scores = "after the gradient", ("score",)
+    charts = (
+        Chart("Official score", {"best so far": "best", "now": "score"}, "v2 score"),
+        Chart("Smooth score", {"smooth score": "smooth_score"}, "of the nominal run"),
+        Chart("Norm of the gradient", {"norm": "slope"}, log=True),
+    )
+
+    def __init__(self, config: GradientConfig, policy: Controller, task: Task):
+        """``policy`` is a controller of the structure that the ascent starts from.
+
+        Raises ``JaxpendError`` if it has nothing to search.
+        """
+        kinds(policy, config.searched)
+        self.config, self.total = config, config.steps
+        self.policy, self.task = policy, task
+
+    @classmethod
+    def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
+        config = getattr(run, "gradient", None)
+        if not (config and config.steps):
+            return None
+        assert start is not None  # a run of this stage alone names one
+        return cls(config, start, task)
+
+    def start(self, seed: int, before: Controller) -> SearchState:
+        key = jax.random.fold_in(jax.random.key(seed), 2)
+        return SearchState(before, init(self.config, before, key), jnp.asarray(0))
+
+    def like(self) -> SearchState:
+        return jax.eval_shape(lambda policy: self.start(0, policy), self.policy)
+
+    def advance(self, states: list[SearchState]) -> list[tuple[SearchState, dict[str, Any]]]:
+        count, after = self.chunk(states[0]), []
+        for state in states:
+            search, metrics = improve(self.config, state.start, state.search, count, self.task)
+            after.append((self.moved(state, search, count), metrics))
+        return after
+
+    def judge(
+        self, state: SearchState, metrics: dict[str, Any]
+    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
+        policy = current(self.config, state.start, state.search)
+        score, worth = self.compared(policy)
+        row = {"score": score, "value": worth, "lost": int(state.search.lost)}
+        return row | {name: values[-1] for name, values in metrics.items()}, [(policy, worth)]
+
+    def note(self, row: dict[str, Any]) -> str:
+        return f"smooth score {float(row['smooth_score']):.4f}  score {row['score']:.4f}"
+
+    def watched(self, state: SearchState) -> Any:
+        return state.search.parameters
 
 
 if __name__ == "__main__":

@@ -9,8 +9,9 @@ on wide ground. All individuals of a generation meet the same noise: common rand
 the comparison fair. Other strategies of evosax stand behind the same options.
 """
 
+import dataclasses
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +20,17 @@ from evosax import algorithms
 
 from . import config
 from .boards import Task, own_task
-from .config import SNESConfig
+from .config import GuardConfig, Run, SNESConfig
 from .controller import Controller, check_controller
+from .controllers.guard import guard
 from .controllers.policy import change_policies
-from .controllers.search_space import coordinates
+from .controllers.search_space import coordinates, kinds
 from .pytree import Pytree, pytree
 from .score import imperfect, performance
+from .stage import Chart, SearchStage, SearchState
 
 __all__ = [
+    "SNES",
     "SNESConfig",
     "SNESState",
     "best_controller",
@@ -177,6 +181,102 @@ def mean_controller(config: SNESConfig, start: Controller, state: SNESState) -> 
 def best_controller(config: SNESConfig, start: Controller, state: SNESState) -> Controller:
     """The individual with the best noisy fitness so far."""
     return _Search(config, start).rebuild(state.best)
+
+
+class SNES(SearchStage):
+    """The stage of training: SNES from any controller, which is guarded before the search.
+
+    Judged, by ``stage.value``, are the mean controller and the best individual so far; both are
+    also scored on the nominal plant and, for the metrics, on fresh noise.
+    """
+
+    name, title, unit, column = "snes", "SNES", "generations", "generation"
+    heading, scores = "after SNES", ("mean_score", "individual_score")
+    charts = (
+        Chart("Fitness", {"mean": "mean_fitness", "best": "max_fitness"}, "noisy v2 score"),
+        Chart("Official score", {"best so far": "best", "mean": "mean_score"}, "v2 score"),
+        Chart("Standard deviation", {"sigma": "sigma"}, "of the parameters"),
+    )
+
+    def __init__(
+        self, config: SNESConfig, policy: Any, task: Task, guarding: GuardConfig | None = None
+    ):
+        """``policy`` is a controller of the structure that the search starts from, before a guard.
+
+        Raises ``JaxpendError`` if it has nothing to search.
+        """
+        self.config, self.total, self.task = config, config.generations, task
+        self.guarding = guarding or GuardConfig()
+        shapes = jax.eval_shape(lambda p: p, policy)
+        self.policy = self.guarded(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes))
+        kinds(self.policy, config.searched)
+        self.fresh_fitness = jax.jit(lambda p, key: fitness(config, p, key, task)[0])
+
+        def evolve_all(policies, searches, count):
+            def one(policy, search):
+                return evolve(config, policy, search, count, task)
+
+            return jax.vmap(one)(policies, searches)
+
+        self.evolve_all = jax.jit(evolve_all, static_argnames="count")
+
+    @classmethod
+    def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
+        config = getattr(run, "snes", None)
+        return cls(config, start, task, getattr(run, "guard", None)) if config else None
+
+    def guarded(self, controller: Controller) -> Controller:
+        """The controller that is searched."""
+        options = dataclasses.asdict(self.guarding)
+        return guard(controller, self.task.robot, self.task.plant, **options)
+
+    def start(self, seed: int, before: Controller) -> SearchState:
+        return self._begin(self.guarded(before), *self._keys(seed))
+
+    def _keys(self, seed):
+        return jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
+
+    def _begin(self, start, key_init, key_fresh):
+        search = init(self.config, start, key_init)
+        return SearchState(start, search, jnp.asarray(0), key_fresh)
+
+    def like(self) -> SearchState:
+        return jax.eval_shape(self._begin, self.policy, *self._keys(0))
+
+    def advance(self, states: list[SearchState]) -> list[tuple[SearchState, dict[str, Any]]]:
+        count = self.chunk(states[0])
+        both = [(state.start, state.search) for state in states]
+        if len(states) == 1:
+            after = [evolve(self.config, *both[0], count, self.task)]
+        else:
+            stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *both)
+            found = self.evolve_all(*stacked, count)
+            after = [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(states))]
+        return [
+            (self.moved(state, search, count), metrics)
+            for state, (search, metrics) in zip(states, after, strict=True)
+        ]
+
+    def judge(
+        self, state: SearchState, metrics: dict[str, Any]
+    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
+        row: dict[str, Any] = {"diverged": int(state.search.diverged)}
+        row |= {name: values[-1] for name, values in metrics.items()}
+        assert state.fresh is not None
+        key, candidates = jax.random.fold_in(state.fresh, self.done(state)), []
+        for name, policy_of in {"mean": mean_controller, "individual": best_controller}.items():
+            policy = policy_of(self.config, state.start, state.search)
+            score, worth = self.compared(policy)
+            row |= {f"{name}_score": score, f"{name}_value": worth}
+            row[f"{name}_fresh_fitness"] = self.fresh_fitness(policy, key)
+            candidates.append((policy, worth))
+        return row, candidates
+
+    def note(self, row: dict[str, Any]) -> str:
+        return f"fitness {float(row['mean_fitness']):.3f}  mean {row['mean_score']:.4f}"
+
+    def watched(self, state: SearchState) -> Any:
+        return state.search.strategy.mean, state.search.strategy.std
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from jaxpend.plant import tip_height
 from jaxpend.report import charts as curves
 from jaxpend.report import figures as plots
 from jaxpend.runs.statistics import interquartile_mean
@@ -51,7 +52,8 @@ def test_an_arm_that_spins_without_end_can_be_drawn():
 
 def test_height_and_torque_show_the_line_and_the_limits(axes):
     t, x = swing()
-    curves.draw_height(axes, t, x, np.array([0.2, 0.3]), end=1.0)
+    y = np.asarray(tip_height(np.array([0.2, 0.3]), x))
+    curves.draw_height(axes, t, y, reach=0.5, height=0.9, end=1.0)
     assert [line.get_ydata()[0] for line in axes.lines] == pytest.approx([-0.5, 0.45])
     assert axes.lines[0].get_ydata()[-1] == pytest.approx(0.5)
     axes = Figure().add_subplot()
@@ -84,7 +86,9 @@ def test_noise_does_not_fill_an_axis(axes):
 
 
 def test_a_page_recolours_charts_and_keeps_their_ids_apart():
-    draw = lambda axes: axes.plot([0, 1], color=plots.PALETTE["one"])  # noqa: E731
+    def draw(axes):
+        axes.plot([0, 1], color=plots.PALETTE["one"])
+
     first, second = (plots.svg(plots.panel(draw), name, 'a "b" & <c>') for name in "xy")
     assert 'aria-label="a &quot;b&quot; &amp; &lt;c>"' in first
     assert "var(--one)" in first
@@ -92,3 +96,20 @@ def test_a_page_recolours_charts_and_keeps_their_ids_apart():
     ids = [{part.split('"')[0] for part in text.split('id="')[1:]} for text in (first, second)]
     assert ids[0]
     assert not ids[0] & ids[1]
+
+
+def test_criteria_and_grids_of_ones_own_are_drawn():
+    grids = {
+        "delay": {"variation": "delay", "values": [0.0, 0.1], "success": [1.0, 0.0]},
+        "delay (2)": {"variation": "delay", "values": [0.2, 0.3], "success": [0.5, 0.0]},
+    }
+    over = {"overall": [0.25, 0.5, 0.5], "scores": {"mine": [0.25, 0.5, 0.5]}}
+    result = {"robot": "acrobot", "overall": 0.5, "scores": {"mine": 0.5}, "over_keys": over}
+    bars, strips, _ = plots.robustness_figure(
+        [result | {"criteria": {"mine": {"grids": grids}}}]
+    ).axes
+    assert [text.get_text() for text in bars.get_yticklabels()] == ["Overall", "mine"]
+    assert [bar.get_width() for bar in bars.patches] == [0.5, 0.5]
+    whiskers = [sorted(line.get_xdata()) for line in bars.lines]
+    assert whiskers == [[0.25, 0.5], [0.25, 0.5]]
+    assert len(strips.images) == 2

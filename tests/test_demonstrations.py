@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,38 +10,57 @@ import pytest
 from conftest import assert_close
 
 from jaxpend import JaxpendError
+from jaxpend.boards import v2
 from jaxpend.controllers import Feedback, Zero
-from jaxpend.env import DoublePendulum, EnvConfig
-from jaxpend.sac.algorithm import SACConfig, init
+from jaxpend.env import Env, EnvConfig
+from jaxpend.sac import Agent, SACConfig, init, structure
 from jaxpend.sac.demonstrations import DemonstrationConfig, collect, imitate, imitation, swingups
 from jaxpend.sac.networks import Actor, to_policy
+from jaxpend.sac.replay import Replay
 from jaxpend.score import official
 
 NOISY = DemonstrationConfig(episodes=4, duration=1.0, action_noise=0.4, kicks=0.5)
 
 
-def parts(rows):
-    """Columns of replay rows: state, previous action, action, reward, next state."""
-    rows = np.asarray(rows)
+def make(robot="pendubot") -> Env:
+    """The environment of the v2 task."""
+    return Env(EnvConfig(), v2(robot).task)
+
+
+def parts(shown):
+    """State, previous action, action, reward, next state of transitions (n, ...)."""
 
     def state(obs):  # of cosines, sines, scaled velocities
+        obs = np.asarray(obs)
         return np.column_stack([np.arctan2(obs[:, 2:4], obs[:, :2]), 20 * obs[:, 4:6]])
 
-    np.testing.assert_array_equal(rows[:, 15], rows[:, 7])
-    return state(rows[:, :7]), rows[:, 6], rows[:, 7], rows[:, 8], state(rows[:, 9:])
+    np.testing.assert_array_equal(shown.next_privileged[:, 0], shown.action)
+    previous, action, reward = shown.privileged[:, 0], shown.action, shown.reward
+    return state(shown.obs), *map(np.asarray, (previous, action, reward)), state(shown.next_obs)
+
+
+def advance(env, x, previous, action):
+    """Next states and rewards by the environment's own step."""
+
+    def one(x, previous, action):
+        after = env.step(env.observe(x, previous, None, None, previous), action)
+        return after.x, after.reward
+
+    return jax.vmap(one)(x, previous, action)
 
 
 @pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
 def test_rows_are_exact_transitions_under_noise(robot):
-    env = DoublePendulum(EnvConfig(robot))
+    env = make(robot)
     law = Feedback(lambda t, x: jnp.full(2, 2.0) * jnp.cos(3 * x[0]))
-    rows, wanted = collect(NOISY, env, law, jax.random.key(0), reward_scale=0.1)
-    assert rows.shape == (400, 16)
-    x, previous, action, reward, next_x = parts(rows)
-    expected, earned = jax.vmap(env.advance)(x, previous, action)
+    shown = collect(NOISY, env, law, jax.random.key(0), reward_scale=0.1)
+    chex.assert_tree_shape_prefix(shown, (400,))
+    x, previous, action, reward, next_x = parts(shown)
+    expected, earned = advance(env, x, previous, action)
     assert_close(next_x, expected, times=5)
     assert_close(reward, 0.1 * np.asarray(earned), times=5)
     # The label is what the controller wanted, the action what it got.
+    wanted = np.asarray(shown.wanted)
     assert_close(wanted, 2.0 * np.cos(3 * x[:, 0]) / 3.0, times=5)
     assert np.abs(action - wanted).max() > 0.05
     assert np.abs(action).max() <= 1
@@ -63,56 +83,50 @@ def test_rows_are_exact_transitions_under_noise(robot):
 def test_without_noise_every_episode_is_the_same():
     quiet = dataclasses.replace(NOISY, action_noise=0.0, kicks=0.0, start_spread=0.0)
     law = Feedback(lambda t, x: jnp.full(2, 2.0) * jnp.cos(3 * x[0]))
-    rows, wanted = collect(
-        quiet, DoublePendulum(EnvConfig()), law, jax.random.key(0), reward_scale=1.0
-    )
-    _, _, action, _, _ = parts(rows)
-    np.testing.assert_array_equal(action, wanted)
-    for episode in np.split(np.asarray(rows), 4):
-        np.testing.assert_array_equal(episode, rows[:100])
+    shown = collect(quiet, make(), law, jax.random.key(0), reward_scale=1.0)
+    np.testing.assert_array_equal(shown.action, shown.wanted)
+    for leaf in jax.tree.leaves(shown):
+        for episode in np.split(np.asarray(leaf), 4):
+            np.testing.assert_array_equal(episode, leaf[:100])
 
 
 def test_saturated_labels_are_left_out():
-    env = DoublePendulum(EnvConfig())
+    env = make()
     law = Feedback(lambda t, x: jnp.where(t < 0.495, 1.5, 9.0) * jnp.ones(2))
-    rows, wanted = collect(NOISY, env, law, jax.random.key(0), reward_scale=0.1)
-    assert rows.shape == (4 * 50, 16)
-    assert_close(wanted, np.full(200, 0.5))
+    shown = collect(NOISY, env, law, jax.random.key(0), reward_scale=0.1)
+    chex.assert_tree_shape_prefix(shown, (4 * 50,))
+    assert_close(shown.wanted, np.full(200, 0.5))
     always = Feedback(lambda t, x: jnp.full(2, -3.0))
     with pytest.raises(JaxpendError, match="asks for all the torque all the time"):
         collect(NOISY, env, always, jax.random.key(0), reward_scale=0.1)
 
 
 def test_a_controller_that_wants_nothing_is_labelled_so():
-    _, wanted = collect(
-        NOISY, DoublePendulum(EnvConfig()), Zero(), jax.random.key(0), reward_scale=0.1
-    )
-    assert not np.asarray(wanted).any()
+    shown = collect(NOISY, make(), Zero(), jax.random.key(0), reward_scale=0.1)
+    assert not np.asarray(shown.wanted).any()
 
 
 def test_imitation_of_the_swing_up_swings_up():
     config = DemonstrationConfig(episodes=150, updates=8000, batch_size=512)
-    env = DoublePendulum(EnvConfig("pendubot"))
-    actor = Actor((64, 64), "tanh", env.seen_size)
+    env, actor = make(), Actor((64, 64), "tanh")
     keys = jax.random.split(jax.random.key(0), 3)
-    rows, wanted = swingups(config, env, keys[0], reward_scale=0.1)
-    assert np.abs(wanted).max() < 0.99
-    untrained = actor.init(keys[1], jnp.zeros(env.observation_size))
-    state = imitation(config, untrained, keys[2])
-    obs = rows[:, : env.observation_size]
+    shown = swingups(config, env, keys[0], reward_scale=0.1)
+    assert np.abs(shown.wanted).max() < 0.99
+    untrained = actor.init(keys[1], shown.obs[0])
+    state, count = imitation(config, untrained, keys[2]), jnp.asarray(len(shown.wanted))
+    stored = Replay(jax.tree.map(lambda leaf: leaf[:, None], shown), jnp.asarray(0), count)
     for _ in range(4):
-        state, loss = imitate(config, actor, state, obs, wanted, 2000)
+        state, loss = imitate(config, actor, state, stored, 2000)
 
     @jax.jit
     def error(params):
-        mean, _ = actor.apply(params, obs)
-        return jnp.mean((jnp.tanh(mean[:, 0]) - wanted) ** 2)
+        mean, _ = actor.apply(params, shown.obs)
+        return jnp.mean((jnp.tanh(mean[:, 0]) - shown.wanted) ** 2)
 
     assert error(state.params) < 0.2 * error(untrained)
     np.testing.assert_allclose(loss[-100:].mean(), error(state.params), rtol=0.5)
     before, after = (
-        official(to_policy(params, actor, env.config), "pendubot")
-        for params in (untrained, state.params)
+        official(to_policy(params, actor, env), "pendubot") for params in (untrained, state.params)
     )
     assert after["success"]
     assert after["score"] > before["score"] + 0.3
@@ -120,22 +134,31 @@ def test_imitation_of_the_swing_up_swings_up():
 
 def test_sac_starts_from_the_imitating_actor_and_its_demonstrations():
     recipe = DemonstrationConfig(episodes=2, duration=1.0, updates=50, batch_size=32, log_std=-2.0)
-    config = SACConfig(
-        num_envs=4, replay_capacity=8, actor_hidden=(8,), critic_hidden=(8,), demonstrations=recipe
+    config, task = (
+        SACConfig(
+            num_envs=4,
+            replay_capacity=8,
+            actor_hidden=(8,),
+            critic_hidden=(8,),
+            demonstrations=recipe,
+        ),
+        v2("pendubot").task,
     )
-    state = init(config, jax.random.key(0))
+    agent = Agent(config, task)
+    state = init(agent, jax.random.key(0))
     alone = dataclasses.replace(config, demonstrations=DemonstrationConfig())
-    untaught = init(alone, jax.random.key(0))
+    untaught = init(Agent(alone, task), jax.random.key(0))
     assert untaught.demonstrations is None
-    shown = state.demonstrations
-    x, previous, action, reward, next_x = parts(shown.rows[: shown.size])
-    expected, earned = jax.vmap(DoublePendulum(config.env).advance)(x, previous, action)
+    shown, n = state.demonstrations.data, int(state.demonstrations.filled)
+    x, previous, action, reward, next_x = parts(jax.tree.map(lambda leaf: leaf[:n, 0], shown))
+    expected, earned = advance(agent.env, x, previous, action)
     assert_close(next_x, expected, times=5)
     assert_close(reward, config.reward_scale * np.asarray(earned), times=5)
     # The same shape for every seed, however many rows were good enough.
-    assert shown.rows.shape == (2 * 100, 17)
-    assert 100 < shown.size < 200
-    assert not np.asarray(shown.rows[shown.size :]).any()
+    chex.assert_tree_shape_prefix(shown, (2 * 100, 1))
+    assert 100 < n < 200
+    assert not any(np.asarray(leaf[n:]).any() for leaf in jax.tree.leaves(shown))
+    chex.assert_trees_all_equal_shapes_and_dtypes(structure(agent)[0], state)
     head = state.actor["params"]["log_std"]
     assert not np.asarray(head["kernel"]).any()
     np.testing.assert_array_equal(head["bias"], [-2.0])
@@ -144,9 +167,8 @@ def test_sac_starts_from_the_imitating_actor_and_its_demonstrations():
 def test_the_swing_up_is_that_of_the_robot():
     recipe = DemonstrationConfig(episodes=1, duration=4.0, action_noise=0, kicks=0, start_spread=0)
     for robot in ("acrobot", "pendubot"):
-        env = DoublePendulum(EnvConfig(robot))
-        rows, _ = swingups(recipe, env, jax.random.key(0), reward_scale=1.0)
-        upright = np.asarray(rows)[-50:, :2] @ [[-1.0], [1.0]]  # cosines
+        shown = swingups(recipe, make(robot), jax.random.key(0), reward_scale=1.0)
+        upright = np.asarray(shown.obs)[-50:, :2] @ [[-1.0], [1.0]]  # cosines
         np.testing.assert_allclose(upright, 2.0, atol=0.05)
 
 

@@ -1,19 +1,24 @@
-"""The learning environment: reward and dynamics by other means, and life under Brax's wrappers."""
+"""The learning environment: reward and dynamics by other means, and its door to Brax."""
 
 import dataclasses
 import math
+import subprocess
+import sys
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs.base import Env
+from brax.envs.base import Env as BraxEnv
 from brax.envs.wrappers import training
 from conftest import assert_close, both_robots
 
 from jaxpend import JaxpendError, designs
+from jaxpend.boards import v2
 from jaxpend.controllers import OpenLoop
-from jaxpend.env import DoublePendulum, EnvConfig, Reward, surrogate_reward
+from jaxpend.env import Env, EnvConfig, Reward, surrogate_reward
+from jaxpend.interop.brax import DoublePendulum
 from jaxpend.observation import Observation
 from jaxpend.plant import rk4_step
 from jaxpend.rollout import rollout
@@ -28,7 +33,13 @@ STATES = {
     "bent": [math.pi, 2.5, 3.0, 1.0],
     "hanging": [0.3, -0.4, -6.0, 4.0],
 }
+ZERO = jnp.zeros(())
 step = jax.jit(lambda env, state, action: env.step(state, action), static_argnums=0)
+
+
+def make(robot="pendubot", **options) -> Env:
+    """The environment of the v2 task."""
+    return Env(EnvConfig(**options), v2(robot).task)
 
 
 def paper_reward(robot, x, action, previous):
@@ -53,9 +64,9 @@ def paper_reward(robot, x, action, previous):
 @pytest.mark.parametrize(("action", "previous"), [(0.0, 0.0), (0.7, -0.5), (-1.0, 0.2)])
 @pytest.mark.x64
 def test_reward_is_the_papers(robot, where, action, previous):
-    env = DoublePendulum(EnvConfig(robot))
+    env = make(robot)
     x = np.array(STATES[where])
-    reward = surrogate_reward(env.plant, env.config.reward, x, action, previous)
+    reward = surrogate_reward(env.plant, env.config.reward, env.line, x, action, previous)
     assert_close(reward, paper_reward(robot, x, action, previous))
 
 
@@ -63,22 +74,23 @@ def test_the_cases_lie_on_both_sides_of_the_line():
     length = designs.competition("acrobot").length
     y = {k: -length @ np.cos([x[0], x[0] + x[1]]) for k, x in STATES.items()}
     assert y["top"] > 0.375 > y["between"] > 0.35 > y["bent"] > y["hanging"]
-    assert EnvConfig("acrobot").reward.line == 0.375
-    assert EnvConfig("pendubot").reward.line == 0.35
+    assert make("acrobot").line == 0.375
+    assert make("pendubot").line == 0.35
+    assert make("acrobot", reward=Reward(line=0.4)).line == 0.4
 
 
 @pytest.mark.x64
 def test_coefficients_and_floor_are_those_of_the_configuration():
     plant = designs.competition("pendubot")
-    other = Reward(line=0.0, alpha=3.0, beta=0.5, rho1=1.0, rho2=2.0, phi1=3.0, phi2=4.0, eta=5.0)
+    other = Reward(alpha=3.0, beta=0.5, rho1=1.0, rho2=2.0, phi1=3.0, phi2=4.0, eta=5.0)
     zeroed = dict.fromkeys(("alpha", "beta", "rho1", "rho2", "phi1", "phi2", "eta"), 0.0)
     for where in ("top", "hanging"):
         x = jnp.array(STATES[where])
 
         def earned(reward, x=x):
-            return float(surrogate_reward(plant, reward, x, 0.5, -0.1))
+            return float(surrogate_reward(plant, reward, 0.0, x, 0.5, -0.1))
 
-        nothing = Reward(line=0.0, **zeroed)
+        nothing = Reward(**zeroed)
         terms = [
             earned(dataclasses.replace(nothing, **{name: getattr(other, name)})) - earned(nothing)
             for name in zeroed
@@ -88,47 +100,59 @@ def test_coefficients_and_floor_are_those_of_the_configuration():
         below = {"rho2", "phi2", "eta"}
         at_work = {name for name, term in zip(zeroed, terms, strict=True) if term != 0}
         assert at_work == (set(zeroed) - below if where == "top" else below)
-        assert earned(dataclasses.replace(other, floor=1e3)) == 1e3
+        assert (earned(other) < -0.5) == (where == "hanging")
+        assert earned(dataclasses.replace(other, floor=-0.5)) == max(earned(other), -0.5)
         assert earned(dataclasses.replace(other, floor=-1e6)) == earned(other)
 
 
 @both_robots
 def test_a_step_is_one_of_the_plant_under_torque_on_the_driven_joint(robot):
-    env = DoublePendulum(EnvConfig(robot, torque_limit=2.5, dt=0.02))
+    env = make(robot, torque_limit=2.5, dt=0.02)
     x = jnp.array(STATES["bent"], jnp.float32)
-    start = env.reset(jax.random.key(0)).replace(
-        pipeline_state={"x": x, "action": jnp.asarray(-0.3)}
-    )
-    after = step(env, start, jnp.array([0.6]))
+    after = step(env, env.observe(x, jnp.asarray(-0.3), None, None, ZERO), 0.6)
     u = np.zeros(2, "f4")
     u[designs.active_joint(robot)] = 0.6 * 2.5
     expected = rk4_step(designs.competition(robot), x, u, 0.02)
-    assert_close(after.pipeline_state["x"], expected)
+    assert_close(after.x, expected)
     assert not np.allclose(expected, rk4_step(designs.competition(robot), x, 0 * u, 0.02))
     # The reward is of the state arrived in and charges the change from the action before.
     assert_close(after.reward, paper_reward(robot, np.float64(expected), 0.6, -0.3), times=5)
-    assert_close(after.obs, [*Observation()(expected), 0.6])
-    assert after.done == 0
+    assert_close(after.obs, Observation()(expected))
+    assert_close(after.privileged, [0.6])
 
 
 def test_actions_are_clipped_to_the_torque_limit():
-    env = DoublePendulum()
+    env = make()
     start = env.reset(jax.random.key(0))
     for beyond, limit in ((3.0, 1.0), (-1.5, -1.0)):
-        clipped = step(env, start, jnp.array([beyond]))
-        jax.tree.map(np.testing.assert_array_equal, clipped, step(env, start, jnp.array([limit])))
-        assert clipped.pipeline_state["action"] == limit
+        clipped = step(env, start, beyond)
+        chex.assert_trees_all_equal(clipped, step(env, start, limit))
+        assert clipped.action == limit
 
 
-@pytest.mark.parametrize(("kind", "size"), [("wrapped", 5), ("sincos", 7)])
-def test_observations_have_the_previous_action_last(kind, size):
-    env = DoublePendulum(EnvConfig(observation=Observation(kind)))
-    state = step(env, env.reset(jax.random.key(0)), jnp.array([0.25]))
-    assert env.observation_size == size == state.obs.shape[0]
-    assert env.action_size == 1
-    assert state.obs[-1] == 0.25
+def test_what_is_no_single_action_is_refused_at_trace_time():
+    env = make()
+    with pytest.raises(AssertionError, match="shape"):
+        step(env, env.reset(jax.random.key(0)), jnp.zeros(1))
+
+
+def test_environments_of_the_same_values_are_the_same_to_jit():
+    assert make() == make()
+    assert hash(make()) == hash(make())
+    assert make() != make("acrobot")
+
+
+@pytest.mark.parametrize(("kind", "size"), [("wrapped", 4), ("sincos", 6)])
+def test_only_the_critics_see_the_previous_action(kind, size):
+    env = make(observation=Observation(kind))
+    state = step(env, env.reset(jax.random.key(0)), 0.25)
+    assert (state.obs.shape, state.privileged.shape) == ((size,), (1,))
+    assert state.privileged == 0.25
+    brax = DoublePendulum(env.config, env.task)
+    sizes = brax.observation_size, brax.seen_size, brax.action_size
+    assert sizes == (size + 1, size, 1)
     near = [
-        env.observe({"x": jnp.array([math.pi, d, 0.0, 0.0]), "action": jnp.zeros(())})
+        env.observe(jnp.array([math.pi, d, 0.0, 0.0]), ZERO, None, None, ZERO).obs
         for d in (-1e-4, 1e-4)
     ]
     jump = np.abs(near[1] - near[0]).max()
@@ -139,30 +163,29 @@ def test_observations_have_the_previous_action_last(kind, size):
 @pytest.mark.parametrize("randomised", [0.0, 1.0])
 def test_history_is_what_was_measured_and_done_before_newest_first(randomised):
     view = Observation(history=2)
-    env = DoublePendulum(EnvConfig("acrobot", observation=view, randomised=randomised))
+    env = make("acrobot", observation=view, randomised=randomised)
     state = env.reset(jax.random.key(3))
     measured, true, actions = [], [], [0.0]
     for action in (0.9, -0.5, 0.3, 0.7):
-        now = state.pipeline_state
-        measured.append(now["world"].measured if randomised else now["x"])
-        true.append(now["x"])
+        measured.append(state.world.measured if randomised else state.x)
+        true.append(state.x)
         before = [np.zeros((2, 4)), *np.array(measured)[None, :-1]]
         before = np.concatenate(before)[:-3:-1]  # hanging at rest before it began
         pushed = np.append([0.0, 0.0], actions[1:])[:-3:-1]
         past = [np.append(view.of_state(x), a) for x, a in zip(before, pushed, strict=True)]
         critics = [view.of_state(true[-1])] if randomised else []
-        expected = [view.of_state(measured[-1]), *past, *critics, [actions[-1]]]
-        assert_close(state.obs, np.concatenate(expected), times=5)
-        assert state.obs.shape == (env.observation_size,)
+        seen = np.concatenate([view.of_state(measured[-1]), *past])
+        assert_close(state.obs, seen, times=5)
+        assert_close(state.privileged, np.concatenate([*critics, [actions[-1]]]), times=5)
         actions.append(action)
-        state = step(env, state, jnp.array([action]))
-    assert env.seen_size == view.size == 6 + 2 * 7
+        state = step(env, state, action)
+    assert state.obs.shape == (view.size,) == (6 + 2 * 7,)
     assert np.abs(np.array(measured)).max() > 0.1
 
 
 @both_robots
 def test_a_randomised_episode_is_a_rollout_in_its_scenario(robot):
-    env = DoublePendulum(EnvConfig(robot, randomised=1.0))
+    env = make(robot, randomised=1.0)
     wrong = sample(env.plant, jax.random.key(1))
     wrong = wrong.replace(
         plant=env.plant.replace(mass=env.plant.mass * 1.1),
@@ -173,117 +196,129 @@ def test_a_randomised_episode_is_a_rollout_in_its_scenario(robot):
         pulses=Pulses(jnp.full((2, 1), 0.1), jnp.full((2, 1), 0.05), jnp.array([[0.4], [-0.2]])),
     )
     state = env.reset(jax.random.key(0))
-    now = state.pipeline_state
-    state = state.replace(
-        pipeline_state=now | {"world": now["world"].replace(scenario=wrong, measured=now["x"])}
-    )
+    state = state.replace(world=state.world.replace(scenario=wrong, measured=state.x))
     actions = np.sin(np.arange(30.0))
     torque = 3.0 * actions[:, None] * (np.arange(2) == designs.active_joint(robot))
     held = OpenLoop(jnp.arange(30) * 0.01 - 1e-4, jnp.asarray(torque, jnp.float32))
     run = rollout(wrong, held, jax.random.key(0), duration=0.3)
     for k, action in enumerate(actions):
-        state = step(env, state, jnp.array([action], jnp.float32))
-        now = state.pipeline_state
-        assert_close(now["x"], run.x[5 * (k + 1)], times=50)
+        state = step(env, state, jnp.asarray(action, jnp.float32))
+        assert_close(state.x, run.x[5 * (k + 1)], times=50)
         if k < 29:
-            assert_close(now["world"].measured, run.x_measured[5 * (k + 1)], times=50)
-        np.testing.assert_array_equal(state.obs[:6], Observation()(now["world"].measured))
-        np.testing.assert_array_equal(state.obs[6:12], Observation()(now["x"]))
-    assert np.abs(now["x"] - now["world"].measured).max() > 0.01
+            assert_close(state.world.measured, run.x_measured[5 * (k + 1)], times=50)
+        np.testing.assert_array_equal(state.obs, Observation()(state.world.measured))
+        np.testing.assert_array_equal(state.privileged[:6], Observation()(state.x))
+    assert np.abs(state.x - state.world.measured).max() > 0.01
 
 
 def test_noise_of_a_scenario_is_measured_and_drawn_anew():
-    env = DoublePendulum(EnvConfig(randomised=1.0))
+    env = make(randomised=1.0)
     state = env.reset(jax.random.key(0))
-    now = state.pipeline_state
     scenario = sample(env.plant, jax.random.key(0), 0.0)
     scenario = scenario.replace(measurement_noise=jnp.array([0.0, 0.1, 0.2, 0.3]))
-    state = state.replace(pipeline_state=now | {"world": now["world"].replace(scenario=scenario)})
-    ends = jax.lax.scan(lambda s, _: (env.step(s, jnp.zeros(1)),) * 2, state, length=400)[1]
-    now = ends.pipeline_state
-    error = np.asarray(now["world"].measured - now["x"])
-    assert_close(now["x"], np.zeros((400, 4)))
+    state = state.replace(world=state.world.replace(scenario=scenario))
+    now = jax.lax.scan(lambda s, _: (env.step(s, ZERO),) * 2, state, length=400)[1]
+    error = np.asarray(now.world.measured - now.x)
+    assert_close(now.x, np.zeros((400, 4)))
     np.testing.assert_allclose(error.std(axis=0), [0.0, 0.1, 0.2, 0.3], rtol=0.15)
     np.testing.assert_allclose(np.corrcoef(error[1:, 1], error[:-1, 1])[0, 1], 0.0, atol=0.2)
 
 
 def test_every_episode_has_its_own_scenario():
-    env = DoublePendulum(EnvConfig(randomised=0.5))
+    env = make(randomised=0.5)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 64))
-    kinds = jax.tree.leaves(states.pipeline_state["world"].scenario)
+    kinds = jax.tree.leaves(states.world.scenario)
     differing = np.array([[not np.array_equal(v, leaf[0]) for v in leaf] for leaf in kinds])
     assert differing.any(axis=1).sum() > 8
 
 
-def batched_legacy(env):
-    return training.wrap(env, episode_length=3), jax.random.split(jax.random.PRNGKey(0), 2)
+def batched(env):
+    return training.wrap(env, episode_length=3)
 
 
-def inner_typed(env):
-    env = training.AutoResetWrapper(training.EpisodeWrapper(env, 3, 1))
-    return training.VmapWrapper(env), jax.random.split(jax.random.key(0), 2)
+def inner(env):
+    return training.VmapWrapper(training.AutoResetWrapper(training.EpisodeWrapper(env, 3, 1)))
 
 
-@pytest.mark.parametrize("wrapped", [batched_legacy, inner_typed])
-def test_brax_wrappers_count_truncate_and_reset(wrapped):
-    bare = DoublePendulum()
-    assert isinstance(bare, Env)
-    env, keys = wrapped(bare)
+@pytest.mark.parametrize(
+    ("wrapped", "key"),
+    [(batched, jax.random.PRNGKey), (inner, jax.random.PRNGKey), (inner, jax.random.key)],
+)
+@pytest.mark.parametrize("randomised", [0.0, 1.0])
+def test_brax_wrappers_count_truncate_and_reset(wrapped, key, randomised):
+    view = Observation(history=2 if randomised else 0)
+    bare = DoublePendulum(EnvConfig(observation=view, randomised=randomised))
+    assert isinstance(bare, BraxEnv)
+    env, keys = wrapped(bare), jax.random.split(key(0), 2)
     state, plain = env.reset(keys), bare.reset(keys[0])
+    now = plain.pipeline_state
+    np.testing.assert_array_equal(plain.obs, np.concatenate([now.obs, now.privileged]))
+    assert now.obs.shape == (bare.seen_size,)
     assert state.obs.shape == (2, env.observation_size)
     actions, wrapped_step = jnp.array([[0.5], [-1.0]]), jax.jit(env.step)
     for k in range(1, 5):
         state = wrapped_step(state, actions)
         plain = step(bare, plain if k != 4 else bare.reset(keys[0]), actions[0])
-        assert_close(state.reward[0], plain.reward)
+        assert_close(state.reward[0], plain.reward, times=5)
         np.testing.assert_array_equal(state.done, [float(k == 3)] * 2)
         np.testing.assert_array_equal(state.info["truncation"], [float(k == 3)] * 2)
         expected = bare.reset(keys[0]).obs if k == 3 else plain.obs
-        assert_close(state.obs[0], expected)
+        assert_close(state.obs[0], expected, times=5)
+    assert plain.done == 0
+
+
+def test_keys_of_either_kind_reset_to_the_same_episode():
+    env = DoublePendulum(EnvConfig(randomised=1.0, upright_starts=0.5))
+    new, old = (env.reset(key(7)) for key in (jax.random.key, jax.random.PRNGKey))
+    np.testing.assert_array_equal(new.obs, old.obs)
+    chex.assert_trees_all_equal(*(s.pipeline_state.world.scenario for s in (new, old)))
 
 
 @pytest.mark.parametrize("kind", ["wrapped", "sincos"])
 @pytest.mark.parametrize("randomised", [0.0, 1.0])
 def test_left_and_right_make_no_difference(kind, randomised):
     view = Observation(kind, history=2)
-    env = DoublePendulum(EnvConfig(observation=view, randomised=randomised))
-    start = jax.eval_shape(env.reset, jax.random.key(0)).pipeline_state
+    env = make(observation=view, randomised=randomised)
+    world = env.reset(jax.random.key(0)).world
     rng = np.random.default_rng(0)
     x, past, measured = rng.uniform(-3, 3, 4), rng.uniform(-1, 1, (2, 5)), rng.uniform(-3, 3, 4)
 
     def seen(side):
-        now = {"x": side * x, "past": side * past, "action": jnp.asarray(side * 0.4)}
-        if randomised:
-            now["world"] = start["world"].replace(measured=side * measured)
-        return env.observe(now)
+        there = world.replace(measured=side * measured) if randomised else None
+        action = jnp.asarray(side * 0.4)
+        return env.observe(jnp.array(side * x), action, jnp.array(side * past), there, ZERO)
 
-    np.testing.assert_allclose(seen(-1), np.array(env.mirrored) * seen(1), atol=1e-6)
-    assert not np.allclose(seen(-1), seen(1))
-    left, right = (env.advance(jnp.array(side * x), side * 0.4, side * 0.7) for side in (-1, 1))
-    np.testing.assert_allclose(left[0], -right[0], rtol=1e-5)
-    np.testing.assert_allclose(left[1], right[1], rtol=1e-5)
+    for name, signs in zip(("obs", "privileged"), env.mirrored, strict=True):
+        left, right = (np.asarray(getattr(seen(side), name)) for side in (-1, 1))
+        np.testing.assert_allclose(left, np.array(signs) * right, atol=1e-6)
+        assert not np.allclose(left, right)
+    calm = make(observation=view)
+    left, right = (calm.step(seen(side).replace(world=None), side * 0.7) for side in (-1, 1))
+    np.testing.assert_allclose(left.x, -right.x, rtol=1e-5)
+    np.testing.assert_allclose(left.reward, right.reward, rtol=1e-5)
 
 
 def test_a_share_of_episodes_starts_near_upright_and_only_there():
-    config = EnvConfig(observation=Observation(history=2), upright_starts=0.25, upright_spread=0.05)
+    env = make(observation=Observation(history=2), upright_starts=0.25, upright_spread=0.05)
     keys = jax.random.split(jax.random.key(0), 4000)
-    now = jax.vmap(DoublePendulum(config).reset)(keys).pipeline_state
-    up = np.any(now["x"] != 0, axis=1)
+    now = jax.vmap(env.reset)(keys)
+    up = np.any(now.x != 0, axis=1)
     np.testing.assert_allclose(up.mean(), 0.25, atol=0.03)  # four standard deviations
-    off = np.asarray(now["x"])[up] - [math.pi, 0, 0, 0]
+    off = np.asarray(now.x)[up] - [math.pi, 0, 0, 0]
     np.testing.assert_allclose(off.std(0), [0.05, 0.05, 0.15, 0.15], rtol=0.1)
     np.testing.assert_allclose(off.mean(0), 0, atol=0.02)
     # It has been there all along, as one that hangs has.
-    np.testing.assert_array_equal(now["past"][:, 1, :4], now["x"])
-    np.testing.assert_array_equal(now["past"][..., 4], 0)
+    np.testing.assert_array_equal(now.past[:, 1, :4], now.x)
+    np.testing.assert_array_equal(now.past[..., 4], 0)
     # The scenario that is met does not depend on where the episode starts.
-    worlds = [
-        DoublePendulum(EnvConfig(randomised=1.0, upright_starts=share)).reset(keys[0])
-        for share in (0.0, 1.0)
-    ]
-    scenarios = [jax.tree.leaves(world.pipeline_state["world"].scenario) for world in worlds]
-    jax.tree.map(np.testing.assert_array_equal, *scenarios)
-    assert worlds[0].pipeline_state["x"][0] == 0 != worlds[1].pipeline_state["x"][0]
+    starts = [make(randomised=1.0, upright_starts=share).reset(keys[0]) for share in (0.0, 1.0)]
+    chex.assert_trees_all_equal(*(start.world.scenario for start in starts))
+    assert starts[0].x[0] == 0 != starts[1].x[0]
+
+
+def test_nobody_who_trains_waits_for_brax():
+    code = "import sys, jaxpend.env, jaxpend.sac; assert 'brax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_episode_steps():

@@ -50,6 +50,17 @@ def test_a_signal_in_a_callback_of_the_garbage_collector_is_not_lost(capfd):
             stop_if_asked()
 
 
+def test_a_signal_that_no_loop_has_answered_is_not_lost(capfd):
+    """It came after the last look: what follows must not go on as if nothing had been said."""
+    with pytest.raises(Stopped), deferred():
+        os.kill(os.getpid(), signal.SIGINT)
+    with deferred():
+        stop_if_asked()
+    with pytest.raises(ZeroDivisionError), deferred():  # what went wrong comes first
+        os.kill(os.getpid(), signal.SIGINT) or 1 / 0
+    stop_if_asked()
+
+
 def test_an_ignored_signal_stays_ignored():
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with deferred():

@@ -6,21 +6,23 @@ import numpy as np
 import pytest
 from conftest import assert_close, both_robots
 
+from jaxpend.boards import v2
 from jaxpend.designs import active_joint
-from jaxpend.env import DoublePendulum, EnvConfig
+from jaxpend.env import Env, EnvConfig
 from jaxpend.observation import Observation
-from jaxpend.sac.networks import Actor, TwinCritic, constant_log_std, sample_action, to_policy
+from jaxpend.sac.critics import TwinCritic
+from jaxpend.sac.networks import Actor, constant_log_std, sample_action, to_policy
 
 STATES = np.random.default_rng(0).normal(size=(5, 4)).astype("f4") * [1, 2, 4, 8]
-OBS = np.random.default_rng(1).normal(size=(5, 7)).astype("f4")
-ACTIONS = np.array([[-0.9], [-0.3], [0.0], [0.4], [0.8]], "f4")
+OBS, BEFORE = np.split(np.random.default_rng(1).normal(size=(5, 7)).astype("f4"), [6], axis=1)
+ACTIONS = np.array([-0.9, -0.3, 0.0, 0.4, 0.8], "f4")
 sample = jax.jit(sample_action)
 
 
 @pytest.fixture(scope="module")
 def actor():
     """A small actor and its parameters, log standard deviations spread out over observations."""
-    net = Actor((16, 8), "tanh", 6)
+    net = Actor((16, 8), "tanh")
     params = net.init(jax.random.key(0), OBS)
     params["params"]["log_std"]["bias"] += 0.3
     return net, params
@@ -32,7 +34,7 @@ def draws(mean, log_std, count=20_000):
     dtype = jnp.result_type(float)
     mean, log_std = jnp.full(shape, mean, dtype), jnp.full(shape, log_std, dtype)
     action, log_prob = sample(mean, log_std, jax.random.key(1))
-    return np.asarray(action)[:, 0], np.asarray(log_prob)
+    return np.asarray(action), np.asarray(log_prob)
 
 
 @pytest.mark.x64
@@ -58,7 +60,7 @@ def test_log_probability_stays_finite_and_right_where_the_tanh_saturates():
         return log_prob.sum(), (action, log_prob)
 
     slope, (action, log_prob) = jax.jit(jax.grad(both, has_aux=True))(mean)
-    assert_close(np.abs(action), np.ones((4, 1)))
+    assert_close(np.abs(action), np.ones(4))
     # log(1 - tanh(v)^2) tends to 2 log 2 - 2 |v|, whose slope is -2 sign(v).
     noise = jax.random.normal(jax.random.key(0), (4, 1))
     normal = -(noise**2) / 2 + 4 - jnp.log(2 * jnp.pi) / 2
@@ -67,16 +69,11 @@ def test_log_probability_stays_finite_and_right_where_the_tanh_saturates():
     assert_close(slope, 2 * np.sign(mean))
 
 
-def test_actor_does_not_see_the_previous_action(actor):
+def test_actor_sees_every_entry_of_the_observation(actor):
     net, params = actor
     apply = jax.jit(net.apply)
-    jax.tree.map(
-        np.testing.assert_array_equal,
-        apply(params, OBS),
-        apply(params, OBS + np.array([0, 0, 0, 0, 0, 0, 5], "f4")),
-    )
     for i in range(6):
-        moved = apply(params, OBS + np.eye(7, dtype="f4")[i])
+        moved = apply(params, OBS + np.eye(6, dtype="f4")[i])
         assert not np.allclose(moved[0], apply(params, OBS)[0])
 
 
@@ -99,21 +96,21 @@ def test_constant_log_std_changes_nothing_else(actor):
 
 
 @pytest.mark.parametrize("layer_norm", [False, True])
-def test_critics_are_two_and_see_everything(layer_norm):
-    net = TwinCritic((8,), "relu", layer_norm)
-    params = net.init(jax.random.key(0), OBS, ACTIONS)
-    apply = jax.jit(net.apply)
-    q = apply(params, OBS, ACTIONS)
+def test_critics_are_two_and_see_everything_and_the_lower_counts(layer_norm):
+    critic = TwinCritic((8,), "relu", layer_norm)
+    params = critic.init(jax.random.key(0), OBS, BEFORE, ACTIONS)
+    apply, now = jax.jit(critic.both), (OBS, BEFORE, ACTIONS)
+    q = apply(params, *now)
     assert q.shape == (5, 2)
     assert not np.allclose(q[:, 0], q[:, 1])
-    shifted = OBS + np.array([0, 0, 0, 0, 0, 0, 1], "f4")
-    for other in (apply(params, shifted, ACTIONS), apply(params, OBS, -ACTIONS - 0.1)):
-        assert np.all(np.any(q != other, axis=0))
+    np.testing.assert_array_equal(jax.jit(critic.value)(params, *now), q.min(axis=1))
+    for other in ((OBS + 0.1, BEFORE, ACTIONS), (OBS, BEFORE + 1, ACTIONS),
+                  (OBS, BEFORE, -ACTIONS - 0.1)):  # fmt: skip
+        assert np.all(np.any(q != apply(params, *other), axis=0))
     # Parameters of the first do not move the second.
     first = {k: v for k, v in params["params"].items() if k in ("Trunk_0", "Dense_0")}
-    moved = apply(
-        {"params": params["params"] | jax.tree.map(lambda w: w + 0.5, first)}, OBS, ACTIONS
-    )
+    moved = params["params"] | jax.tree.map(lambda w: w + 0.5, first)
+    moved = apply({"params": moved}, *now)
     np.testing.assert_array_equal(moved[:, 1], q[:, 1])
     assert np.all(moved[:, 0] != q[:, 0])
     assert ("LayerNorm_0" in params["params"]["Trunk_0"]) == layer_norm
@@ -123,9 +120,10 @@ def test_critics_are_two_and_see_everything(layer_norm):
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
 @pytest.mark.parametrize("kind", ["wrapped", "sincos"])
 def test_policy_acts_as_the_actors_mean(robot, activation, kind):
-    env = EnvConfig(robot, torque_limit=2.5, dt=0.02, observation=Observation(kind))
-    obs = jax.vmap(DoublePendulum(env).observe)({"x": STATES, "action": jnp.zeros(5)})
-    net = Actor((16, 8), activation, env.observation.size)
+    config = EnvConfig(torque_limit=2.5, dt=0.02, observation=Observation(kind))
+    env, zero = Env(config, v2(robot).task), jnp.zeros(())
+    obs = jax.vmap(lambda x: env.observe(x, zero, None, None, zero).obs)(STATES)
+    net = Actor((16, 8), activation)
     params = net.init(jax.random.key(0), obs)
     policy = to_policy(params, net, env)
     torque = jax.vmap(lambda x: policy((None, None), 0.0, x)[1])(STATES)

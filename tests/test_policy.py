@@ -11,9 +11,10 @@ import pytest
 from conftest import assert_close, both_robots, refused, rewrite
 
 from jaxpend import JaxpendError, Policy, load_policy, save_policy
+from jaxpend.boards import v2
 from jaxpend.controllers.files import read_header
 from jaxpend.designs import active_joint
-from jaxpend.env import DoublePendulum, EnvConfig
+from jaxpend.env import Env, EnvConfig
 from jaxpend.observation import Observation
 from jaxpend.rollout import rollout
 
@@ -114,14 +115,14 @@ def test_memory_goes_back_whole_periods_however_often_it_is_asked(calls):
 @both_robots
 def test_a_rollout_at_the_period_of_training_is_an_episode_of_the_environment(robot):
     policy = random_policy(robot, activation="tanh", history=2)
-    env = DoublePendulum(EnvConfig(robot, observation=policy.observation))
+    env = Env(EnvConfig(observation=policy.observation), v2(robot).task)
     run = jax.jit(lambda: rollout(env.plant, policy, KEY, dt=0.01, duration=0.4))()
     state, step = env.reset(KEY), jax.jit(env.step)
     for k in range(40):
-        wanted = numpy_torque(policy, state.obs[: env.seen_size])
+        wanted = numpy_torque(policy, state.obs)
         assert_close(run.u[k][active_joint(robot)], wanted, times=20)
-        state = step(state, jnp.array([wanted / 3.0], jnp.float32))
-    assert_close(run.x[40], state.pipeline_state["x"], times=20)
+        state = step(state, jnp.asarray(wanted / 3.0, jnp.float32))
+    assert_close(run.x[40], state.x, times=20)
     forgetful = policy.replace(layers=((policy.layers[0][0].at[6:].set(0), policy.layers[0][1]),
                                        *policy.layers[1:]))  # fmt: skip
     other = rollout(env.plant, forgetful, KEY, dt=0.01, duration=0.4)

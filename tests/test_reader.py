@@ -4,23 +4,39 @@ import fcntl
 import json
 import os
 import statistics
+import subprocess
+import sys
 
 import pytest
+from conftest import refused
 
 from jaxpend import JaxpendError, cli
-from jaxpend.runs.reader import listing
+from jaxpend.cli.tables import runs_table
+from jaxpend.files import to_json
+from jaxpend.runs.reader import listing, read_run, remarks
 
+STAGES = [
+    {"name": "imitation", "title": "Imitation", "unit": "updates", "column": "updates",
+     "total": 4000, "heading": "", "charts": [], "scores": []},
+    {"name": "sac", "title": "SAC", "unit": "steps", "column": "env_steps", "total": 100,
+     "heading": "after SAC", "charts": [["Score", {"now": "score"}, "v2 score", False]],
+     "scores": ["score"]},
+    {"name": "climb", "title": "Climbing", "unit": "metres", "column": "metres", "total": 1000,
+     "heading": "after climbing", "charts": [], "scores": ["height"]},
+]  # fmt: skip
 CONFIG = {
-    "robot": "acrobot", "seed": 3, "snes": {"generations": 1000},
-    "sac": {"steps": 100, "demonstrations": {"updates": 4000}},
+    "robot": "acrobot", "seed": 3, "sac": {"steps": 100, "demonstrations": {"updates": 4000}},
+    "snes": {"generations": 1000},
 }  # fmt: skip
 
 
-def make(folder, rows=(), result=None, config=CONFIG):
-    """A run folder as training leaves it."""
+def make(folder, rows=(), result=None, config=CONFIG, stages=None):
+    """A run folder as training leaves it; without stages, as version 0.1 left it."""
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps(config))
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    if stages is not None:
+        (folder / "run.json").write_text(json.dumps({"version": "0.2.0", "stages": stages}))
     if result is not None:
         (folder / "result.json").write_text(json.dumps(result))
     return folder
@@ -61,7 +77,7 @@ def test_every_state_is_told_apart(runs):
         "done": ("finished", None, 0.5),
         "foreign": ("broken", "config.json", None),
         "half": ("interrupted", "SAC 50/100", None),
-        "imitates": ("interrupted", "imitation 2,000/4,000", None),
+        "imitates": ("interrupted", "Imitation 2,000/4,000", None),
         "new": ("interrupted", "the start", None),
     }
     done = entries["done"]
@@ -93,6 +109,150 @@ def test_a_group_of_seeds_is_one_row_with_the_median(tmp_path):
     (group,) = listing(tmp_path)
     assert (group["state"], group["at"]) == ("interrupted", "3 of 4 seeds")
     assert group["score"] == 0.3
+
+
+CLIMB = [*SAC, {"stage": "climb", "seconds": 9.25, "metres": 250, "height": 0.5, "note": "high"}]
+
+
+def test_what_a_run_says_of_its_stages_is_believed(tmp_path):
+    result = {"start": {"score": 0.1}, "sac": {"score": 0.2}, "climb": {"score": 0.5}, "score": 0.5}
+    make(tmp_path / "half", CLIMB, stages=STAGES)
+    make(tmp_path / "done", CLIMB, result, stages=STAGES)
+    done, half = listing(tmp_path)
+    assert (half["at"], half["stages"]) == ("Climbing 250/1,000", ["sac", "climb"])
+    assert (done["score"], done["seconds"]) == (0.5, 9.25)
+    run = read_run(tmp_path / "half")
+    assert run.progress == {"imitation": (0, 4000), "sac": (100, 100), "climb": (250, 1000)}
+    assert "Imitation is at 0 of 4,000 updates" in remarks([run])[0]
+    assert "Climbing is at 250 of 1,000 metres" in remarks([run])[0]
+    assert run.stages[1].charts == (("Score", {"now": "score"}, "v2 score", False),)
+    results = read_run(tmp_path / "done").results
+    assert list(results) == ["start", "after SAC", "after climbing"]
+    assert results["after climbing"] == {"score": 0.5}
+
+
+def test_the_best_policy_is_that_of_the_last_stage(tmp_path):
+    folder = make(tmp_path / "half", CLIMB, stages=STAGES)
+    assert read_run(folder).policy is None
+    for name in ("sac_best.npz", "climb_best.npz", "policy.npz"):
+        (folder / name).touch()
+        assert read_run(folder).policy == str(folder / name)
+
+
+OLD = [
+    {"stage": "imitation", "seconds": 1.0, "updates": 4000, "loss": 0.1},
+    {"stage": "sac", "seconds": 2.5, "env_steps": 50, "updates": 7, "score": 0.1, "uptime": 2.0},
+    {"stage": "sac", "seconds": 3.5, "env_steps": 100, "updates": 9, "score": 0.2, "reward": 1.0},
+    {"stage": "snes", "seconds": 9.25, "generation": 10, "mean_fitness": 0.1, "mean_score": 0.3},
+]
+
+
+def test_runs_of_version_0_1_can_be_read(tmp_path):
+    config = json.loads(json.dumps(CONFIG))
+    config["sac"]["demonstrations"]["episodes"] = 3
+    config |= {"gradient": {"steps": 0, "learning_rate": 1e-4}, "guard": {"after": 2.0}}
+    stage = {"robot": "acrobot", "score": 0.25, "success": False, "criteria": {}, "seconds": 3.0}
+    result = {"robot": "acrobot", "seed": 3, "sac": stage, "score": 0.5}
+    result["snes"] = stage | {"score": 0.5, "success": True, "criteria": {"swingup_time": 2.0}}
+    folder = make(tmp_path / "old", OLD, result, config)
+    about = {"version": "0.1.0", "jax": "0.10.2", "command": "jaxpend train --seed 3"}
+    (folder / "run.json").write_text(json.dumps(about))
+    run = read_run(folder)
+    assert run.made_by == about
+    assert run.progress == {"imitation": (4000, 4000), "sac": (100, 100), "snes": (10, 1000)}
+    assert list(run.results) == ["after SAC", "after SNES"]
+    _, sac, snes = run.stages
+    assert (sac.column, sac.scores, snes.scores) == ("env_steps", ("score",), ("mean_score",))
+    columns = [list(curves.values()) for _, curves, _, _ in sac.charts]
+    assert columns == [["updates"], ["score"], ["uptime"], ["reward"]]
+    (entry,) = listing(tmp_path)
+    assert (entry["state"], entry["score"]) == ("finished", 0.5)
+    (folder / "result.json").unlink()
+    assert listing(tmp_path)[0]["at"] == "SNES 10/1,000"
+
+
+JUNK = [None, 3, -1e400, "text", [], [[1]], {}, {"a": {"b": [None]}}, True, 10**400]
+
+
+def spoilt(value):
+    """A JSON value with every part of it, one after the other, replaced by junk or left out."""
+    yield from JUNK
+    if isinstance(value, dict):
+        for name, part in value.items():
+            yield {k: v for k, v in value.items() if k != name}
+            yield from (value | {name: bad} for bad in spoilt(part))
+    if isinstance(value, list):
+        for k, part in enumerate(value[:2]):
+            yield from ([*value[:k], bad, *value[k + 1 :]] for bad in spoilt(part))
+
+
+RESULT = {
+    "robot": "acrobot", "seed": 3, "score": 0.5,
+    "sac": {"score": 0.5, "success": True, "criteria": {"swingup_time": 1.0}, "seconds": 2.0},
+}  # fmt: skip
+CONTENT = {
+    "config.json": CONFIG,
+    "run.json": {"version": "0.2.0", "command": "c", "stages": STAGES[:2]},
+    "result.json": RESULT,
+    "metrics.jsonl": CLIMB[0] | {"score": 0.5, "finite": 1, "rollbacks": 2},
+}
+
+
+@pytest.mark.parametrize("name", CONTENT)
+def test_files_of_wrong_types_break_no_more_than_their_run(tmp_path, name):
+    folder = make(tmp_path / "spoilt", SAC, RESULT, stages=STAGES[:2])
+    make(tmp_path / "good", SAC, RESULT, stages=STAGES[:2])
+    for bad in spoilt(CONTENT[name]):
+        (folder / name).write_text(json.dumps(bad) + "\n")
+        good, entry = listing(tmp_path)
+        assert good["state"] == "finished"
+        runs_table([entry, good])
+        json.loads(to_json([entry]), parse_constant=pytest.fail)
+        if entry["state"] == "broken":
+            assert (entry["at"], entry["score"]) == (name, None)
+            with refused(f"{folder / name} is not"):
+                read_run(folder)
+            continue
+        run = read_run(folder)
+        assert entry["state"] == ("finished" if run.result else "interrupted"), bad
+        remarks([run])
+        assert all(isinstance(result["score"], int | float) for result in run.results.values())
+        for row in run.rows:
+            assert all(k == "stage" or isinstance(v, int | float) for k, v in row.items())
+
+
+@pytest.mark.parametrize("name", CONTENT)
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"[" * 100_000, b"9" * 5000, b"{}"])
+def test_files_that_are_no_json_break_no_more_than_their_run(tmp_path, name, content):
+    folder = make(tmp_path / "spoilt", SAC, stages=STAGES[:2])
+    make(tmp_path / "good", SAC, RESULT, stages=STAGES[:2])
+    (folder / name).write_bytes(content)
+    (folder / "dangling").symlink_to(tmp_path / "nothing")
+    good, entry = listing(tmp_path)
+    assert good["state"] == "finished"
+    harmless = name == "metrics.jsonl" or (name, content) == ("run.json", b"{}")
+    assert entry["state"] == ("interrupted" if harmless else "broken")
+
+
+@pytest.mark.parametrize("content", ["", "0", "-1", "text", "9" * 30])
+def test_a_lock_of_nobody_is_no_lock(tmp_path, content):
+    (make(tmp_path / "run", SAC) / ".lock").write_text(content)
+    assert listing(tmp_path)[0]["state"] == "interrupted"
+
+
+def test_folders_of_any_name_can_be_listed(tmp_path):
+    names = {"²", "2", "10", "a²", "a10", "[bold]", "x"}
+    for name in names:
+        make(tmp_path / name, SAC)
+    assert {run["run"] for run in listing(tmp_path)} == names
+    runs_table(listing(tmp_path))
+
+
+def test_runs_are_read_without_jax(tmp_path):
+    make(tmp_path / "run", SAC, stages=STAGES)
+    code = "import sys; from jaxpend.runs.reader import listing; listing(sys.argv[1]); "
+    code += "assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code, tmp_path], check=True)
 
 
 def command(monkeypatch, capsys, *arguments):

@@ -3,26 +3,33 @@
 import json
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import browser
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
 
 from jaxpend import cli, load_policy, save_policy
-from jaxpend.boards import v2
+from jaxpend.boards import Board, v2
 from jaxpend.cli import commands
-from jaxpend.config import TrainRun
+from jaxpend.config import DemonstrationConfig, SACConfig, TrainRun
 from jaxpend.config_files import to_mapping
 from jaxpend.controllers.policy import network_in
+from jaxpend.pytree import pytree
 from jaxpend.report import page
-from jaxpend.runs import record as report
+from jaxpend.runs import reader as report
+from jaxpend.runs.folder import RunFolder, changed
 from jaxpend.score import official
+from jaxpend.train.loop import stages_of
 
 # Characters that mean something in HTML must not.
 NAME = "odd <i> & \"co\""  # fmt: skip
+MADE_BY = {"command": "python -m jaxpend.train --seed <7>", "version": "0.0.7"}
 SNES = {"mean_fitness": 0.6, "max_fitness": 0.7, "sigma": 0.01}
 
 
@@ -30,15 +37,17 @@ def sac(steps, score, **more):
     return {"stage": "sac", "env_steps": steps, "score": score, "reward": 1.0, "seconds": 1} | more
 
 
-def make_run(folder, rows, *, policy="policy.npz", result=True, **config):
+def make_run(folder, rows, *, policy="policy.npz", result=True, about=MADE_BY, **config):
     """A run folder as training leaves it, with the policy that ships as its policy."""
     folder.mkdir(parents=True)
-    config = to_mapping(TrainRun(robot="pendubot", **config))
-    (folder / "config.json").write_text(json.dumps(config))
+    config = TrainRun(robot="pendubot", **config)
+    (folder / "config.json").write_text(json.dumps(to_mapping(config)))
+    stages = [stage.about() for stage in stages_of(config, None, v2("pendubot").task).values()]
+    about = {"stages": stages, "changed": changed(config)} | about
+    (folder / "run.json").write_text(json.dumps(about))
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     if policy:
-        made_by = {"command": "python -m jaxpend.train --seed <7>", "version": "0.0.7"}
-        save_policy(folder / policy, load_policy("pendubot"), made_by)
+        save_policy(folder / policy, load_policy("pendubot"), MADE_BY)
     if result:
         stage = {"score": 0.5, "success": False, "seconds": 61, "criteria": {}}
         (folder / "result.json").write_text(json.dumps({"sac": stage, "score": 0.5}))
@@ -80,8 +89,12 @@ def test_the_page_ranks_the_run_among_the_published(made):
     assert titles[:2] == ["odd &lt;i&gt; &amp; &#34;co&#34;", "HistorySAC"]
     assert [own for own, _, _ in board[:2]] == [' class="own"', ""]
     measured = json.loads((made.folder / "report" / "pendubot.json").read_text())
-    assert float(board[0][2]) == pytest.approx(measured["overall"], abs=6e-4)
+    by_key = measured["over_keys"]["overall"]
+    assert len(by_key) == 3
+    assert "median of 3 keys" in made.text
+    assert float(board[0][2]) == pytest.approx(np.median(by_key), abs=6e-4)
     assert cells(made.text, "Time delay")[-1] == f"{100 * measured['scores']['delay']:.1f} %"
+    assert cells(made.text, "mean of the six")[-1] == f"{100 * np.median(by_key):.1f} %"
 
 
 def test_the_policy_that_ships_is_above_every_published_row(made):
@@ -179,23 +192,20 @@ def test_seeds_keep_their_axis(tmp_path):
 
 def test_curves_know_the_best_so_far_through_all_stages(made):
     (run,) = report.find(made.folder)
-    x, y = page._curve(run, "sac", "best")
+    sac, snes = run.stages
+    x, y = page._curve(run, sac, "best")
     assert (x.tolist(), y.tolist()) == ([0, 25_000, 50_000], [0.1, 0.4, 0.4])
-    assert page._curve(run, "snes", "best")[1].tolist() == [0.4, 0.4]
-    assert [len(page._curve(run, "sac", name)[0]) for name in ("temperature", "critic_loss")] == [
-        1,
-        0,
-    ]
+    assert page._curve(run, snes, "best")[1].tolist() == [0.4, 0.4]
+    assert len(page._curve(run, sac, "temperature")[0]) == 1
+    assert len(page._curve(run, sac, "critic_loss")[0]) == 0
 
 
 def test_what_went_wrong_is_said(tmp_path):
     rows = [{"stage": "imitation", "updates": 20, "loss": 0.1}, sac(0, 0.2)]
     rows += [sac(25, 0.9, finite=0, rollbacks=1), sac(50, 0.1, rollbacks=1)]
-    folder = make_run(tmp_path / "hard", rows, result=False)
-    config = json.loads((folder / "config.json").read_text())
-    config["sac"]["demonstrations"] |= {"episodes": 3, "updates": 20}
-    (folder / "config.json").write_text(json.dumps(config))
-    (folder / "run.json").write_text('{"command": "jaxpend train --seed 5", "version": "0.9"}')
+    sac_config = SACConfig(demonstrations=DemonstrationConfig(episodes=3, updates=20))
+    about = {"command": "jaxpend train --seed 5", "version": "0.9"}
+    folder = make_run(tmp_path / "hard", rows, result=False, about=about, sac=sac_config)
     (run,) = report.find(folder)
     first, second = report.remarks([run])
     assert first.startswith(
@@ -203,9 +213,18 @@ def test_what_went_wrong_is_said(tmp_path):
     )
     assert second == "hard diverged and went back to its last good state 1 time."
     # What diverged is no best score.
-    assert page._curve(run, "sac", "best")[1].tolist() == [0.2, 0.2]
-    assert page._curve(run, "imitation", "loss")[1].tolist() == [0.1]
+    assert page._curve(run, run.stages[1], "best")[1].tolist() == [0.2, 0.2]
+    assert page._curve(run, run.stages[0], "loss")[1].tolist() == [0.1]
     assert run.made_by["command"] == "jaxpend train --seed 5"
+
+
+def test_a_run_folder_says_what_differs_from_the_defaults(tmp_path):
+    config = TrainRun(robot="acrobot", seed=7, sac=SACConfig(steps=12))
+    with RunFolder(tmp_path / "run", config, "jaxpend train"):
+        pass
+    (run,) = report.find(tmp_path / "run")
+    default = to_mapping(SACConfig())["steps"]
+    assert run.made_by["changed"] == {"seed": [7, 0], "sac.steps": [12, default]}
 
 
 def test_rows_that_came_twice_count_once_in_order(tmp_path):
@@ -239,6 +258,22 @@ def test_policies_can_be_shown_without_a_run(tmp_path, monkeypatch):
             lambda folder: make_run(folder, []).joinpath("config.json").write_text("[]"),
             "is not the",
         ),
+        (
+            lambda folder: make_run(folder, []).joinpath("run.json").write_text('{"stages": [3]}'),
+            "run.json is not what a run says of itself; the run cannot be read",
+        ),
+        (
+            lambda folder: (
+                make_run(folder, [])
+                .joinpath("run.json")
+                .write_text('{"stages": [], "changed": {"seed": 3}}')
+            ),
+            "run.json is not what a run says of itself; the run cannot be read",
+        ),
+        (
+            lambda folder: make_run(folder, []).joinpath("result.json").write_text('{"score": ""}'),
+            "result.json is not the result of a run; the run cannot be read",
+        ),
         (lambda folder: make_run(folder, []).joinpath("policy.npz").write_bytes(b""), "cut off"),
         (lambda folder: folder.write_text("text"), "is not a policy file"),
     ],
@@ -267,6 +302,92 @@ def test_a_policy_that_fails_is_shown_failing(tmp_path):
     assert "<dd>0.0000</dd>" in text
     assert "not above the 0.9 line at the end" in text
     assert "The first 10 s" in text
+
+
+@pytree
+class Breaking:
+    """Pushes for a while; then it gives what is no number."""
+
+    steps: int
+
+    def reset(self, key):
+        return jnp.zeros((), int)
+
+    def __call__(self, step, t, x):
+        torque = jnp.where(step < self.steps, jnp.array([6.0, 0.0]), jnp.nan)
+        return step + 1, torque
+
+
+@pytest.mark.parametrize("steps", [0, 7])
+def test_a_run_that_diverges_is_shown_as_far_as_it_went(tmp_path, monkeypatch, steps):
+    monkeypatch.setattr("jaxpend.report.judged.load_controller", lambda *_, **__: Breaking(steps))
+    monkeypatch.setattr("jaxpend.report.judged.read_header", lambda _: {})
+    run = report.RunRecord("broken", "pendubot", {}, (), [], None, "pendubot")
+    path = page.write([run], tmp_path, title="broken", robustness=False)
+    text = path.read_text()
+    assert "<dd>0.0000</dd>" in text
+    assert "NaN" not in text
+    assert "The first 1 s" in text
+    film = json.loads(re.search(r'id="film">(.*?)</script>', text).group(1))
+    assert len(film["runs"][0]["theta1"]) == steps // 5 + 1
+    assert {p.name for p in (tmp_path / "report").iterdir()} >= {"swingup.gif", "swingup.png"}
+
+
+ODD = ["$x_ a\\b{$^$} %s{{ 1 }}", "\udcff \u4e2d\n\U0001f355"]
+
+
+@pytest.mark.parametrize("name", ODD, ids=("signs", "not in the font"))
+def test_a_name_may_have_any_character(tmp_path, name):
+    run = report.RunRecord(name, "pendubot", {}, (), [], None, "pendubot")
+    page.write([run], tmp_path, title=name, robustness=False)
+    assert (tmp_path / "report" / "swingup.png").exists()
+
+
+def test_a_run_on_a_plant_of_its_own_is_not_beside_the_published(tmp_path):
+    plant = dict(v2("pendubot").task.parameters)
+    heavy = {"plant": plant | {"m2": 1.02 * plant["m2"]}}
+    folder = make_run(tmp_path / "heavy", [], about=heavy)
+    (run,) = report.find(folder)
+    text = page.write([run], folder, title="heavy", robustness=False).read_text()
+    own = v2("pendubot").task.of(heavy["plant"])
+    truth = official(load_policy("pendubot"), Board("own", own))["score"]
+    assert f"<dd>{truth:.4f}</dd>" in text
+    assert abs(truth - 0.6995) > 1e-4  # the score on the board
+    assert "<dt>v2 on a plant of its own</dt>" in text
+    assert "official v2" not in text
+    assert "HistorySAC" not in text
+
+
+def test_a_run_of_version_0_1_has_a_page(tmp_path):
+    """Its run.json says nothing of its stages."""
+    rows = [sac(0, 0.1), sac(25, 0.4, temperature=0.1)]
+    rows += [{"stage": "snes", "generation": 9, "mean_score": 0.35, **SNES}]
+    folder = make_run(tmp_path / "old", rows)
+    (folder / "run.json").write_text('{"version": "0.1.0", "command": "jaxpend train --seed 3"}')
+    (run,) = report.find(folder)
+    assert page._curve(run, run.stages[0], "best")[1].tolist() == [0.1, 0.4]
+    commands.report(folder, robustness=False)
+    text = (folder / "report.html").read_text()
+    for words in ("jaxpend train --seed 3", "SAC: temperature", "SNES: mean fitness", "after SAC"):
+        assert words in text
+
+
+def test_the_users_matplotlib_stays_as_it_is(tmp_path):
+    code = """
+import pathlib, sys
+import matplotlib
+matplotlib.use("pdf")
+matplotlib.rcParams["font.size"] = 17
+before = dict(matplotlib.rcParams)
+import jaxpend.report.page, jaxpend.report.animation, jaxpend.report.charts
+import jaxpend.report.figures as figures, jaxpend.report.judged
+figures.save(figures.stack([lambda axes: axes.plot([0, 1])]), pathlib.Path(sys.argv[1]))
+figures.svg(figures.panel(lambda axes: axes.plot([0, 1])), "a", "a")
+assert dict(matplotlib.rcParams) == before
+assert matplotlib.get_backend() == "pdf"
+"""
+    subprocess.run([sys.executable, "-c", code, tmp_path / "a.png"], check=True)
+    assert (tmp_path / "a.png").exists()
 
 
 # --- in a browser --------------------------------------------------------------------------

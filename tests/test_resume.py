@@ -3,20 +3,26 @@
 import dataclasses
 import json
 import signal
+from types import SimpleNamespace
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from training_runs import arrays_of, result_of, rows_of
 
-from jaxpend import JaxpendError, Policy, load_policy, sac, snes
+from jaxpend import JaxpendError, Policy, load_policy, snes
+from jaxpend.boards import v2
 from jaxpend.config import EnvConfig, SACConfig, SACRun, SNESConfig
 from jaxpend.observation import Observation
 from jaxpend.runs.checkpoints import Checkpoints
+from jaxpend.sac import algorithm
+from jaxpend.sac.stage import SAC
+from jaxpend.snes import SNES
 from jaxpend.train.interrupt import Stopped
-from jaxpend.train.loop import all_finite, train
-from jaxpend.train.stages import SAC, SNES
+from jaxpend.train.loop import train
+from jaxpend.train.seed_run import all_finite
 
 SMALL = SACConfig(
     steps=96, eval_every=32, num_envs=8, batch_size=32, replay_capacity=128, warmup_steps=32,
@@ -25,18 +31,21 @@ SMALL = SACConfig(
 )  # fmt: skip
 
 
+TASK = v2("pendubot").task
+
+
 def poison(monkeypatch, *poisoned):
     """Let the calls of these numbers of a chunk return a temperature that is not a number."""
-    chunk, calls = sac.train_chunk, []
+    chunk, calls = algorithm.train_chunk, []
 
-    def train_chunk(config, state, steps):
+    def train_chunk(agent, state, steps):
         calls.append(state)
-        state, metrics = chunk(config, state, steps)
+        state, metrics = chunk(agent, state, steps)
         if len(calls) in poisoned:
             state = state.replace(log_temperature=state.log_temperature * jnp.nan)
         return state, metrics
 
-    monkeypatch.setattr(sac, "train_chunk", train_chunk)
+    monkeypatch.setattr(algorithm, "train_chunk", train_chunk)
     return calls
 
 
@@ -50,12 +59,14 @@ def diverging(tmp_path, **options):
 def test_divergence_stops_with_the_last_good_state_on_disk(tmp_path, capfd, monkeypatch):
     poison(monkeypatch, *range(2, 9))
     text, rows = diverging(tmp_path)
-    start = "SAC diverged at 64 steps; the last good state, in SAC at 32 of 96 steps, is in"
+    unit = "environment steps"
+    start = f"SAC diverged at 64 {unit}; the last good state, in SAC at 32 of 96 {unit}, is in"
     assert text.startswith(f"{start} {tmp_path / 'run' / 'checkpoints'}, the best policy beside")
     assert "--on-divergence rollback" in text
     assert [(row["env_steps"], row.get("finite", 1)) for row in rows] == [(0, 1), (32, 1), (64, 0)]
+    stage = SAC(SMALL, TASK)
     found, about = Checkpoints(tmp_path / "run" / "checkpoints").newest(
-        lambda about: {"state": sac.structure(SMALL)[0], "best": SAC(SMALL).policy_like()}
+        lambda about: {"state": stage.like(), "best": stage.policy_like()}
     )
     assert (int(found["state"].env_steps), about["stage"]) == (32, "sac")
     assert all_finite(found["state"])
@@ -67,7 +78,8 @@ def test_divergence_stops_with_the_last_good_state_on_disk(tmp_path, capfd, monk
     assert text.startswith(start)
     assert "--on-divergence" not in text
     assert [row["rollbacks"] for row in rows if row.get("finite") == 0] == [0, 1, 2]
-    assert capfd.readouterr().err.count("going on in SAC at 32 of 96 steps with another key") == 2
+    said = capfd.readouterr().err
+    assert said.count(f"going on in SAC at 32 of 96 {unit} with another key") == 2
 
 
 def test_a_rollback_goes_on_from_the_last_chunk_with_another_key(tmp_path, monkeypatch):
@@ -79,9 +91,37 @@ def test_a_rollback_goes_on_from_the_last_chunk_with_another_key(tmp_path, monke
         (32, 1, 0), (64, 0, 0), (64, 1, 1), (96, 1, 1),
     ]  # fmt: skip
     before, after = calls[1:3]
-    np.testing.assert_array_equal(before.replay.rows, after.replay.rows)
+    chex.assert_trees_all_equal(before.replay, after.replay)
     assert not np.array_equal(*(jax.random.key_data(s.key) for s in (before, after)))
     assert rows[2]["reward"] != rows[3]["reward"]
+
+
+@pytest.mark.parametrize(
+    ("steps", "chunks"), [(96, [4, 4, 4]), (65, [4, 4, 1]), (33, [4, 1]), (32, [4]), (1, [1])]
+)
+def test_sac_ends_at_its_budget_in_whole_steps_of_all_environments(monkeypatch, steps, chunks):
+    def train_chunk(config, state, vector_steps):
+        found.append(vector_steps)
+        return state.replace(env_steps=state.env_steps + 8 * vector_steps), {}
+
+    monkeypatch.setattr(algorithm, "train_chunk", train_chunk)
+    found, small = [], dataclasses.replace(SMALL, steps=steps)
+    stage, state = SAC(small, TASK), SimpleNamespace(env_steps=0)
+    state.replace = lambda env_steps: SimpleNamespace(env_steps=env_steps, replace=state.replace)
+    while stage.done(state) < stage.total:
+        ((state, _),) = stage.advance([state])
+    assert found == chunks
+    assert stage.done(state) == 8 * sum(chunks) < steps + 8
+
+
+def test_a_shorter_last_chunk_changes_nothing_before_it(tmp_path):
+    for steps in (96, 65):
+        train(
+            SACRun(run=f"{steps}", runs=str(tmp_path), sac=dataclasses.replace(SMALL, steps=steps))
+        )
+    longer, shorter = (rows_of(tmp_path / run, "sac") for run in ("96", "65"))
+    assert [row["env_steps"] for row in shorter] == [0, 32, 64, 72]
+    assert shorter[:3] == longer[:3]
 
 
 def test_seeds_in_one_vmap_stop_resume_and_come_to_what_they_come_to_alone(tmp_path, monkeypatch):
@@ -96,7 +136,9 @@ def test_seeds_in_one_vmap_stop_resume_and_come_to_what_they_come_to_alone(tmp_p
             raise Stopped(signal.SIGINT)
 
     monkeypatch.setattr("jaxpend.train.loop.stop_if_asked", look)
-    with pytest.raises(Stopped, match="stopped in SAC at 32 of 96 steps; everything is in "):
+    with pytest.raises(
+        Stopped, match="stopped in SAC at 32 of 96 environment steps; everything is in "
+    ):
         train(together)
     assert not (tmp_path / "together" / "seeds.json").exists()
     group = train(together)
@@ -116,24 +158,24 @@ def test_seeds_in_one_vmap_stop_resume_and_come_to_what_they_come_to_alone(tmp_p
 
 
 def test_searches_in_one_vmap_come_to_what_they_come_to_alone(monkeypatch):
-    def fitness(config, policy, key, robot):
+    def fitness(config, policy, key, task):
         distance = sum(jnp.sum((leaf - 0.1) ** 2) for leaf in jax.tree.leaves(policy.layers))
         return -distance, jnp.zeros((), jnp.int32)
 
     monkeypatch.setattr(snes, "fitness", fitness)
     snes.evolve.clear_cache()
     policy = Policy(((jnp.zeros((6, 1)), jnp.zeros(1)),), torque_limit=jnp.asarray(3.0))
-    stage = SNES(SNESConfig(generations=6, population=4, chunk=4), policy, "pendubot")
+    stage = SNES(SNESConfig(generations=6, population=4, chunk=4), policy, TASK)
     states = [stage.start(seed, policy) for seed in (1, 2)]
     loop = [stage.advance([state])[0] for state in states]
     # Of the same types as before, weak or strong, so that the next chunk is not compiled again.
-    before, after = (jax.tree.map(jax.typeof, s["search"]) for s in (states[0], loop[0][0]))
+    before, after = (jax.tree.map(jax.typeof, s.search) for s in (states[0], loop[0][0]))
     assert before == after
     for alone, together in zip(loop, stage.advance(states), strict=True):
         assert jax.tree.structure(alone) == jax.tree.structure(together)
         assert stage.done(alone[0]) == stage.done(together[0]) == 4
         for a, b in zip(*map(stage.watched, (alone[0], together[0])), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
-    assert not np.array_equal(*(state["search"].strategy.mean for state, _ in loop))
+    assert not np.array_equal(*(state.search.strategy.mean for state, _ in loop))
     assert stage.done(stage.advance([loop[0][0]])[0][0]) == 6  # and not beyond the last
     snes.evolve.clear_cache()

@@ -8,13 +8,14 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
-from conftest import limited_file_size
+from conftest import limited_file_size, refused
 
 from jaxpend import JaxpendError, Policy, cli, load_policy
-from jaxpend.config import TrainRun
+from jaxpend.config import SACRun, TrainRun
 from jaxpend.config_files import to_mapping
 from jaxpend.controllers.files import read_header
 from jaxpend.runs.folder import RunFolder
+from jaxpend.train import train
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
@@ -55,13 +56,101 @@ def test_the_same_run_is_taken_up_again_wherever_the_folder_is(tmp_path):
     config = TrainRun("acrobot", run="a", runs=str(tmp_path))
     with RunFolder(tmp_path / "a", config, "first") as folder:
         folder.log("sac", score=0.5)
-    (tmp_path / "a" / ".policy.npz.1234").touch()  # of a process killed while it wrote
+    # Of a process killed while it wrote.
+    (tmp_path / "a" / ".policy.npz.jaxpend-tmp-1234").touch()
     (tmp_path / "a").rename(tmp_path / "b")
     config = dataclasses.replace(config, run="b", on_divergence="rollback")
     with RunFolder(tmp_path / "b", config, "second") as folder:
         assert len((folder.path / "metrics.jsonl").read_text().splitlines()) == 1
         assert not list(folder.path.glob("*npz*"))
+        assert not list(folder.path.glob(".*npz*"))
         assert json.loads((folder.path / "run.json").read_text())["command"] == "first"
+
+
+def tree(folder):
+    """Every file in a folder, with what is in it."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def user_folder(folder):
+    """A folder with files of a user, under names that a run has too."""
+    (folder / "checkpoints").mkdir(parents=True)
+    for name in ("policy.npz", ".config.1", "metrics.jsonl", "run.json", "checkpoints/000001.npz"):
+        (folder / name).write_text(f"mine: {name}")
+    return folder
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+@pytest.mark.parametrize("name", ["policy.npz", ".config.1", "run.json", "seeds.json", "all"])
+def test_a_folder_that_is_no_run_keeps_its_files(tmp_path, name, seeds):
+    folder = tmp_path / "mine"
+    if name == "all":
+        user_folder(folder)
+    else:
+        folder.mkdir()
+        (folder / name).write_text("mine")
+    before = tree(tmp_path)
+    with refused(f"{folder} is not empty and holds no run"):
+        train(SACRun(runs=str(tmp_path), run="mine", seeds=seeds))
+    assert tree(tmp_path) == before
+
+
+def test_a_seed_whose_folder_is_no_run_stops_all_before_anything_is_made(tmp_path):
+    user_folder(tmp_path / "mine" / "seed1")
+    before = sorted(tmp_path.rglob("*"))
+    with refused("seed1 is not empty and holds no run"):
+        train(SACRun(runs=str(tmp_path), run="mine", seeds=2))
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_run_and_a_group_of_seeds_do_not_share_a_folder(tmp_path):
+    RunFolder(tmp_path / "one", Outer(), "command").close()
+    with refused("holds no runs of several seeds"):
+        train(SACRun(runs=str(tmp_path), run="one", seeds=2))
+    RunFolder(tmp_path / "many" / "seed0", Outer(), "command").close()
+    with refused("many is not empty and holds no run"):
+        train(SACRun(runs=str(tmp_path), run="many"))
+
+
+def test_a_run_that_was_killed_while_it_began_can_begin_again(tmp_path):
+    (tmp_path / ".lock").write_text("1234")
+    (tmp_path / ".config.json.jaxpend-tmp-1234").write_text("{")
+    RunFolder(tmp_path, Outer(), "command").close()
+    (tmp_path / "config.json").unlink()
+    with RunFolder(tmp_path, Outer(), "again") as folder:
+        assert {p.name for p in folder.path.iterdir()} == {".lock", "config.json", "run.json"}
+
+
+def test_only_its_own_temporary_files_are_removed_from_a_run(tmp_path):
+    RunFolder(tmp_path, Outer(), "command").close()
+    own = (".config.1", ".policy.npz.4711", "policy.npz.jaxpend-tmp-3", ".a.jaxpend-tmp-3.txt")
+    for name in own:
+        (tmp_path / name).write_text("mine")
+    (tmp_path / ".policy.npz.jaxpend-tmp-3").touch()
+    RunFolder(tmp_path, Outer(), "command").close()
+    names = {p.name for p in tmp_path.iterdir()}
+    assert names == {*own, ".lock", "config.json", "run.json"}
+
+
+def test_a_run_says_its_stages_and_its_plant_and_goes_on_with_no_other(tmp_path):
+    about = {"plant": {"m1": 0.5, "l1": 0.2}, "stages": [{"name": "sac", "column": "env_steps"}]}
+    with RunFolder(tmp_path, Outer(), "command", about) as folder:
+        made_by = json.loads((folder.path / "run.json").read_text(), parse_constant=pytest.fail)
+    assert {name: made_by[name] for name in about} == about
+    RunFolder(tmp_path, Outer(), "command", about).close()
+    other = about | {"plant": {"m1": 0.6, "l1": 0.2}}
+    before = tree(tmp_path)
+    with refused("holds a run with plant.m1 0.5, not 0.6; choose another name"):
+        RunFolder(tmp_path, Outer(), "command", other)
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("text", ["[]", "3", '{"score": "high"}', "{}", "[" * 100_000])
+def test_a_result_of_wrong_types_is_one_sentence(tmp_path, text):
+    RunFolder(tmp_path, Outer(), "command").close()
+    (tmp_path / "result.json").write_text(text)
+    with refused("result.json is damaged; choose another name or remove"):
+        RunFolder(tmp_path, Outer(), "command")
 
 
 def test_only_one_process_works_on_a_run(tmp_path):

@@ -5,48 +5,74 @@ import math
 from collections.abc import Callable
 from functools import partial
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from brax.envs.base import State
 from conftest import assert_close, refused
 
-from jaxpend.env import EnvConfig
+from jaxpend.boards import v2
+from jaxpend.env import EnvConfig, EnvState
 from jaxpend.sac import algorithm as sac
+from jaxpend.sac import losses
+from jaxpend.sac import replay as buffer
 from jaxpend.sac.algorithm import SACConfig
 from jaxpend.sac.networks import constant_log_std
+from jaxpend.sac.replay import Replay, Transition
 
-KEY = jax.random.key(0)
-ROW = 12  # observation (state, previous action), action, reward, next observation
+KEY, TASK = jax.random.key(0), v2("pendubot").task
+ROW = 12  # obs (4,), privileged (1,), action, reward, next obs, next privileged
 
 
 @dataclasses.dataclass(frozen=True)
 class Probe:
-    """An environment with random starts behind the seam that SAC asks: ``make``."""
+    """An environment with random starts of the form that SAC asks for."""
 
     advance: Callable  # (state (4,), previous action, action) -> next state, reward
-    episode_steps: int = 8
-    max_speed: float = math.inf
 
-    observation_size, seen_size = 5, 4
-
-    def make(self):
-        return self
-
-    def observe(self, x, action):
-        return jnp.append(x, action)
-
-    def reset(self, rng):
-        x, zero = jax.random.uniform(rng, (4,), minval=-1.0), jnp.zeros(())
-        return State({"x": x, "action": zero}, self.observe(x, zero), zero, zero, {}, {})
+    def reset(self, key):
+        x, zero = jax.random.uniform(key, (4,), minval=-1.0), jnp.zeros(())
+        return EnvState(x, zero, None, None, x, zero[None], zero)
 
     def step(self, state, action):
-        before = state.pipeline_state
-        x, reward = self.advance(before["x"], before["action"], action[0])
-        after = {"x": x, "action": action[0]}
-        return state.replace(pipeline_state=after, obs=self.observe(x, action[0]), reward=reward)
+        x, reward = self.advance(state.x, state.action, action)
+        return EnvState(x, action, None, None, x, action[None], reward)
+
+
+@dataclasses.dataclass(frozen=True)
+class Agent(sac.Agent):
+    """An agent in a probe."""
+
+    advance: Callable
+
+    @property
+    def env(self):
+        return Probe(self.advance)
+
+
+def columns(transition):
+    """The fields of transitions (..., ROW) side by side."""
+    return np.concatenate(
+        [leaf if leaf.ndim > transition.action.ndim else leaf[..., None]
+         for leaf in map(np.asarray, jax.tree.leaves(transition))], axis=-1,
+    )  # fmt: skip
+
+
+def transitions(rows, obs_size=4):
+    """The inverse; one column more are wanted actions."""
+    n, rows = obs_size, jnp.asarray(rows)
+    fields = jnp.split(rows, np.cumsum([n, 1, 1, 1, n, 1]), axis=-1)
+    obs, privileged, action, reward, next_obs, next_privileged, wanted = fields
+    wanted = wanted[..., 0] if wanted.size else None
+    now = obs, privileged, action[..., 0], reward[..., 0]
+    return Transition(*now, next_obs, next_privileged, wanted)
+
+
+def changed(agent, **options):
+    """The agent with another configuration."""
+    return dataclasses.replace(agent, config=dataclasses.replace(agent.config, **options))
 
 
 def stay(x, previous, action):
@@ -73,35 +99,34 @@ small = partial(
 )  # fmt: skip
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _probes_are_environments():
-    """SAC makes its environments of these configurations too."""
-    real, patch = sac.DoublePendulum, pytest.MonkeyPatch()
-    make = lambda config: config.make() if isinstance(config, Probe) else real(config)  # noqa: E731
-    patch.setattr(sac, "DoublePendulum", make)
-    yield
-    patch.undo()
+def probing(advance, episode_steps=8, max_speed=math.inf, **options):
+    """An agent in a probe with episodes of so many steps."""
+    env = EnvConfig(dt=1.0, duration=float(episode_steps), max_speed=max_speed)
+    return Agent(small(env=env, **options), TASK, advance)
 
 
-VALUE = small(env=Probe(stay), discount=0.8, init_temperature=0.5, actor_delay=10**9)
-CREDIT = small(env=Probe(credit), discount=0.9, init_temperature=0.02, target_entropy=-2.0)
-REPLAY = small(
-    env=Probe(drift, episode_steps=5, max_speed=3.5), num_envs=4, replay_capacity=15,
-    warmup_steps=8, reward_scale=0.5,
+VALUE = probing(stay, discount=0.8, init_temperature=0.5, actor_delay=10**9)
+CREDIT = probing(credit, discount=0.9, init_temperature=0.02, target_entropy=-2.0)
+REPLAY = probing(
+    drift, episode_steps=5, max_speed=3.5, num_envs=4, replay_capacity=15, warmup_steps=8,
+    reward_scale=0.5,
 )  # fmt: skip
 update = jax.jit(sac.update, static_argnums=0)
 interact = jax.jit(sac.interact, static_argnums=0)
 
 
-def greedy(config, state, obs):
-    """Greedy actions for observations (n, 5)."""
-    return np.tanh(sac.networks(config)[0].apply(state.actor, jnp.asarray(obs))[0])[:, 0]
+def greedy(agent, state, obs):
+    """Greedy actions (n,) for what the policy sees (n, 4)."""
+    return np.tanh(agent.actor.apply(state.actor, jnp.asarray(obs))[0])[:, 0]
 
 
 def leaves_equal(a, b):
     """Whether two pytrees are the same, bit by bit."""
-    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    return all(np.array_equal(x, y) for x, y in pairs)
+    try:
+        chex.assert_trees_all_equal(a, b)
+    except AssertionError:
+        return False
+    return True
 
 
 def without_keys(state):
@@ -127,8 +152,7 @@ def test_values_bootstrap_through_the_time_limit_with_the_entropy_on_top():
     np.testing.assert_allclose(metrics["entropy"], entropy, atol=0.02)
     x = np.zeros((9, 4), "f4")
     x[:, 0] = np.linspace(-0.6, 0.6, 9)
-    obs = np.concatenate([x, np.zeros((9, 1), "f4")], axis=1)
-    q = sac.networks(VALUE)[1].apply(state.critic, obs, np.zeros((9, 1), "f4"))
+    q = VALUE.critic.both(state.critic, x, np.zeros((9, 1), "f4"), np.zeros(9, "f4"))
     expected = (1 + x[:, :1] + 0.8 * 0.5 * entropy) / (1 - 0.8)
     np.testing.assert_allclose(q, np.repeat(expected, 2, axis=1), atol=0.6)
     np.testing.assert_allclose(q.mean(), expected.mean(), atol=0.25)
@@ -139,9 +163,9 @@ def test_values_bootstrap_through_the_time_limit_with_the_entropy_on_top():
 
 def test_actions_are_paid_for_now_and_one_step_later(solved):
     state, _ = solved
-    early = greedy(CREDIT, state, [[-0.5, 0, 0, 0, 0.5]])
+    early = greedy(CREDIT, state, [[-0.5, 0, 0, 0]])
     assert early[0] > 0.6
-    late = greedy(CREDIT, state, [[0.5, a, 0, 0, a] for a in (0.7, 0.9)])
+    late = greedy(CREDIT, state, [[0.5, a, 0, 0] for a in (0.7, 0.9)])
     np.testing.assert_allclose(late, 0.5, atol=0.12)
 
 
@@ -151,15 +175,16 @@ def test_same_key_same_bits_and_another_key_other_bits(solved):
     assert leaves_equal((without_keys(again), more), (without_keys(state), metrics))
     other = sac.init(CREDIT, jax.random.key(1))
     assert not leaves_equal(other.actor, sac.init(CREDIT, KEY).actor)
-    counts = [int(state.env_steps), int(state.updates), int(state.replay.size)]
-    assert counts == [300 * 16, 300 * CREDIT.updates_per_step, 4096]
-    assert int(state.replay.position) == 300 * 16 - 4096
+    counts = [int(state.env_steps), int(state.updates), int(state.replay.filled)]
+    assert counts == [300 * 16, 300 * CREDIT.config.updates_per_step, 4096 // 16]
+    assert int(state.replay.position) == 300 - 4096 // 16
 
 
-def batch_of(config, seed=0):
-    """Replay rows of an update (batch_size, ROW) from a fixed seed."""
-    shape = (config.batch_size, ROW)
-    return jnp.asarray(np.random.default_rng(seed).uniform(-1, 1, shape), jnp.float32)
+def batch_of(agent, more=0):
+    """A batch of an update from a fixed seed; with one column more actions are wanted."""
+    shape = (agent.config.batch_size, ROW)
+    rows = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, shape), jnp.float32)
+    return transitions(jnp.pad(rows, ((0, 0), (0, more))))
 
 
 def with_actor(state, log_std, log_temperature=0.0):
@@ -173,13 +198,16 @@ def test_critics_learn_towards_the_lower_target_value_of_the_next_observation():
     shifted = jax.tree.map(lambda w: w + 0.3, state.target)
     state = with_actor(state, -10.0, -20.0).replace(target=shifted)  # no noise, no entropy
     after, metrics = update(CREDIT, state, batch, KEY)
-    obs, action, reward, next_obs = np.split(batch, (5, 6, 7), axis=1)
-    critic = sac.networks(CREDIT)[1]
-    next_action = greedy(CREDIT, state, next_obs)[:, None]
-    q_next = np.asarray(critic.apply(state.target, next_obs, next_action))
+    both = CREDIT.critic.both
+    next_seen = batch.next_obs, batch.next_privileged
+    next_action = greedy(CREDIT, state, batch.next_obs)
+    q_next = np.asarray(both(state.target, *next_seen, next_action))
     assert 0.0 < np.mean(q_next[:, 0] < q_next[:, 1]) < 1.0
-    target = reward + 0.9 * q_next.min(axis=1, keepdims=True)
-    q = np.asarray(critic.apply(state.critic, obs, action))
+    np.testing.assert_array_equal(
+        CREDIT.critic.value(state.target, *next_seen, next_action), q_next.min(axis=1)
+    )
+    target = np.asarray(batch.reward)[:, None] + 0.9 * q_next.min(axis=1, keepdims=True)
+    q = np.asarray(both(state.critic, batch.obs, batch.privileged, batch.action))
     np.testing.assert_allclose(metrics["critic_loss"], np.mean((q - target) ** 2), rtol=1e-3)
     np.testing.assert_allclose(metrics["value"], q.mean(), rtol=1e-3)
     # The targets follow at their rate.
@@ -193,7 +221,7 @@ def test_temperature_holds_the_entropy_at_its_target():
     fresh, batch = sac.init(CREDIT, KEY), batch_of(CREDIT)
     for log_std, rises in ((-5.0, True), (0.0, False)):
         after, metrics = update(CREDIT, with_actor(fresh, log_std), batch, KEY)
-        assert (metrics["entropy"] < CREDIT.target_entropy) == rises
+        assert (metrics["entropy"] < CREDIT.config.target_entropy) == rises
         assert_close(after.log_temperature, 3e-3 if rises else -3e-3)
 
 
@@ -206,16 +234,16 @@ def test_actor_spreads_out_when_the_temperature_is_high():
 
 
 def test_imitation_pulls_the_demonstrated_half_towards_the_wanted_actions():
-    config = dataclasses.replace(CREDIT, imitation=100.0, env=Probe(stay))
-    state, half = sac.init(config, KEY), config.batch_size // 2
-    batch = jnp.pad(batch_of(config), ((0, 0), (0, 1)))
+    agent = changed(dataclasses.replace(CREDIT, advance=stay), imitation=100.0)
+    state, half = sac.init(agent, KEY), agent.config.batch_size // 2
+    batch = batch_of(agent, more=1)
     # Demonstrations live where x0 > 0; the other half wants nothing, whatever its column says.
-    sign = jnp.where(jnp.arange(config.batch_size) < half, 1.0, -1.0)
-    batch = batch.at[:, 0].set(sign * (0.5 + 0.5 * jnp.abs(batch[:, 0])))
-    batch = batch.at[:, -1].set(jnp.where(sign > 0, 0.6, -1.0))
+    sign = jnp.where(jnp.arange(2 * half) < half, 1.0, -1.0)
+    obs = batch.obs.at[:, 0].set(sign * (0.5 + 0.5 * jnp.abs(batch.obs[:, 0])))
+    batch = batch.replace(obs=obs, wanted=jnp.where(sign > 0, 0.6, -1.0))
     for key in jax.random.split(KEY, 150):
-        state, _ = update(config, state, batch, key)
-    actions = greedy(config, state, batch[:, :5])
+        state, _ = update(agent, state, batch, key)
+    actions = greedy(agent, state, obs)
     np.testing.assert_allclose(actions[:half].mean(), 0.6, atol=0.1)
     assert actions[half:].mean() > -0.5
 
@@ -230,13 +258,13 @@ def run_interaction(steps):
 
 
 def test_replay_holds_the_last_transitions_as_they_were():
-    history, capacity = list(run_interaction(8)), 12  # the multiple of num_envs below 15
-    assert history[0][0].replay.rows.shape == (capacity, ROW)
+    history = list(run_interaction(8))  # 12 rows: the multiple of num_envs below 15
+    assert columns(history[0][0].replay.data).shape == (3, 4, ROW)
     for k, (before, after, mean_reward) in enumerate(history):
         replay = after.replay
-        assert (replay.position, replay.size) == (4 * (k + 1) % 12, min(4 * (k + 1), 12))
-        rows = np.asarray(replay.rows[4 * k % 12 : 4 * k % 12 + 4])
-        x, previous = (np.asarray(before.env_x.pipeline_state[name]) for name in ("x", "action"))
+        assert (replay.position, replay.filled) == ((k + 1) % 3, min(k + 1, 3))
+        rows = columns(replay.data)[k % 3]
+        x, previous = np.asarray(before.envs.x), np.asarray(before.envs.action)
         action = rows[:, 5]
         np.testing.assert_array_equal(rows[:, :4], x)
         np.testing.assert_array_equal(rows[:, 4], previous)
@@ -246,32 +274,40 @@ def test_replay_holds_the_last_transitions_as_they_were():
         step = np.stack([action, previous, np.zeros(4), -np.ones(4)], axis=1)
         assert_close(rows[:, 7:11], x + step)
         np.testing.assert_array_equal(rows[:, 11], action)
-        wanted = greedy(REPLAY, before, before.env_x.obs)
-        uniform = 4 * k < REPLAY.warmup_steps
+        wanted = greedy(REPLAY, before, before.envs.obs)
+        uniform = 4 * k < REPLAY.config.warmup_steps
         assert np.allclose(action, wanted, atol=1e-3) != uniform
         # What is not being written is kept.
-        kept = np.ones(12, bool)
-        kept[4 * k % 12 : 4 * k % 12 + 4] = False
-        np.testing.assert_array_equal(replay.rows[kept], before.replay.rows[kept])
+        kept = np.arange(3) != k % 3
+        kept = [jax.tree.map(lambda leaf, i=kept: leaf[i], r.data) for r in (replay, before.replay)]
+        chex.assert_trees_all_equal(*kept)
+
+
+def test_actions_do_not_depend_on_what_only_the_critics_see():
+    state = with_actor(sac.init(CREDIT, KEY), -1.0)
+    envs = state.envs.replace(privileged=state.envs.privileged + 5)
+    both = [interact(CREDIT, s, KEY)[0].replay.data for s in (state, state.replace(envs=envs))]
+    np.testing.assert_array_equal(both[0].action, both[1].action)
+    assert both[0].action[0].std() > 0.1
+    assert not np.array_equal(both[0].privileged, both[1].privileged)
 
 
 def test_episodes_end_by_time_and_by_speed_and_start_anew():
     cut_by, starts = set(), []
     for before, after, _ in run_interaction(12):
-        row = int(before.env_steps) % 12
-        arrived = np.asarray(after.replay.rows[row : row + 4, 7:11])
+        arrived = np.asarray(after.replay.data.next_obs[int(before.env_steps) // 4 % 3])
         late = np.asarray(before.env_time) + 1 >= 5
         fast = np.abs(arrived[:, 2:]).max(axis=1) > 3.5
         ended = late | fast
         cut_by |= {(bool(a), bool(b)) for a, b in zip(late, fast, strict=True)}
         expected = np.where(ended, 0, np.asarray(before.env_time) + 1)
         np.testing.assert_array_equal(after.env_time, expected)
-        x, action = (np.asarray(after.env_x.pipeline_state[name]) for name in ("x", "action"))
+        x, action = np.asarray(after.envs.x), np.asarray(after.envs.action)
         np.testing.assert_array_equal(x[~ended], arrived[~ended])
         assert np.all(np.abs(x[ended]) <= 1)
         assert not action[ended].any()
-        obs = np.concatenate([x, action[:, None]], axis=1)
-        np.testing.assert_array_equal(after.env_x.obs, obs)
+        np.testing.assert_array_equal(after.envs.obs, x)
+        np.testing.assert_array_equal(after.envs.privileged, action[:, None])
         starts.extend(x[ended, 0])
     assert {(True, False), (False, True), (False, False)} <= cut_by
     assert len(set(starts)) == len(starts) > 8  # a fresh key at every reset
@@ -285,47 +321,67 @@ def test_environments_start_at_different_times_of_the_episode():
 
 
 def test_batches_come_from_filled_rows_and_half_of_them_from_demonstrations():
-    config, state = CREDIT, sac.init(CREDIT, KEY)
-    marked = jnp.arange(4096.0)[:, None] * jnp.ones(ROW)
-    replay = sac.Replay(marked, jnp.asarray(20), jnp.asarray(20))
-    own = np.asarray(sac.sample(config, state.replace(replay=replay), KEY))
-    assert own.shape == (config.updates_per_step, 64, ROW)
+    state, filled = sac.init(CREDIT, KEY), jnp.asarray(5)
+    marked = transitions(jnp.arange(4096.0).reshape(1024, 4, 1) * jnp.ones(ROW))
+    state = state.replace(replay=Replay(marked, filled, filled))
+    own = columns(sac.sample(CREDIT, state, KEY))
+    assert own.shape == (CREDIT.config.updates_per_step, 64, ROW)
     assert set(own[..., 0].ravel()) == set(range(20))
-    rows = -1 - jnp.arange(9.0)[:, None] * jnp.ones(ROW + 1)
-    demonstrations = sac.Demonstrations(rows, jnp.asarray(7))
-    state = state.replace(replay=replay, demonstrations=demonstrations)
-    both = np.asarray(sac.sample(config, state, KEY))
-    assert both.shape == (config.updates_per_step, 64, ROW + 1)
+    assert (own == own[..., :1]).all()
+    shown = transitions(-1 - jnp.arange(9.0)[:, None, None] * jnp.ones(ROW + 1))
+    state = state.replace(demonstrations=Replay(shown, jnp.asarray(0), jnp.asarray(7)))
+    both = columns(sac.sample(CREDIT, state, KEY))
+    assert both.shape == (CREDIT.config.updates_per_step, 64, ROW + 1)
     assert set(both[:, :32].ravel()) == set(range(-7, 0))
     assert set(both[:, 32:, :ROW].ravel()) == set(range(20))
     assert not both[:, 32:, ROW].any()
 
 
+def test_demonstrations_fill_the_front_of_a_buffer_of_one_environment():
+    rows = transitions(1 + jnp.arange(3.0 * (ROW + 1)).reshape(3, ROW + 1))
+    empty = buffer.init(jax.tree.map(lambda leaf: leaf[0], rows), times=5, environments=1)
+    full = buffer.fill(empty, rows)
+    assert (full.filled, full.position) == (3, 0)
+    np.testing.assert_array_equal(columns(full.data)[:3, 0], columns(rows))
+    assert not columns(full.data)[3:].any()
+    chex.assert_trees_all_equal_shapes_and_dtypes(empty, full)
+
+
+def test_what_does_not_fit_together_is_said_at_trace_time():
+    state, batch = sac.init(REPLAY, KEY), batch_of(CREDIT)
+    with pytest.raises(AssertionError, match="shape"):
+        buffer.add(state.replay, batch)  # 64 environments into a buffer of 4
+    with pytest.raises(AssertionError, match="shape"):
+        losses.soft_target(batch.reward[:, None], batch.reward, batch.reward, 0.9)
+    with pytest.raises(AssertionError, match="rank"):
+        losses.squared_error(batch.reward, batch.reward)
+
+
 def test_mirrored_batches_are_rows_as_they_were_and_what_a_mirror_shows_of_them():
-    config = small(env=EnvConfig(), mirror=True)
-    columns = 2 * 7 + 2
-    row = 1 + jnp.arange(columns + 1.0)  # observation, action, reward, observation, wanted
-    state = sac.init(config, KEY)
-    state = state.replace(
-        replay=sac.Replay(row[None, :columns], jnp.asarray(0), jnp.asarray(1)),
-        demonstrations=sac.Demonstrations(row[None], jnp.asarray(1)),
+    agent = sac.Agent(small(env=EnvConfig(), mirror=True), TASK)
+    wide = 2 * 7 + 2
+    row = 1 + jnp.arange(wide + 1.0)  # obs and privileged, action, reward, the next, wanted
+    one, none = jnp.asarray(1), jnp.asarray(0)
+    state = sac.init(agent, KEY).replace(
+        replay=Replay(transitions(row[None, None, :wide], 6), none, one),
+        demonstrations=Replay(transitions(row[None, None], 6), none, one),
     )
     signs = np.array([1, 1, -1, -1, -1, -1, -1, -1, 1, 1, 1, -1, -1, -1, -1, -1, -1])
-    batches = np.asarray(sac.sample(config, state, KEY))
-    for part, wanted in ((batches[:, :32], columns + 1), (batches[:, 32:], 0)):
+    batches = columns(sac.sample(agent, state, KEY))
+    for part, wanted in ((batches[:, :32], wide + 1), (batches[:, 32:], 0)):
         whole = np.append(row[:-1], wanted)
-        found, counts = np.unique(part.reshape(-1, columns + 1), axis=0, return_counts=True)
+        found, counts = np.unique(part.reshape(-1, wide + 1), axis=0, return_counts=True)
         assert {tuple(f) for f in found} == {tuple(whole), tuple(signs * whole + 0.0)}
         assert counts.min() > 0.3 * counts.sum()  # 128 draws: four standard deviations
 
 
 def test_nothing_is_learned_during_warmup():
-    config = dataclasses.replace(CREDIT, warmup_steps=3 * 16, updates_per_step=1)
-    start = sac.init(config, KEY)
+    agent = changed(CREDIT, warmup_steps=3 * 16, updates_per_step=1)
+    start = sac.init(agent, KEY)
     learned = [jax.tree.map(jnp.copy, start.actor)]
     state, updates = start, []
     for _ in range(5):
-        state, _ = sac.train_chunk(config, state, 1)
+        state, _ = sac.train_chunk(agent, state, 1)
         updates.append(int(state.updates))
         learned.append(jax.tree.map(jnp.copy, state.actor))
     assert updates == [0, 0, 0, 1, 2]
@@ -334,7 +390,7 @@ def test_nothing_is_learned_during_warmup():
 
 def test_learning_rate_decays_over_the_whole_run():
     config = small(steps=16 * 5, updates_per_step=2, final_learning_rate=0.1)
-    transformation, rates = sac.optimizer(config), []
+    transformation, rates = sac.Agent(config, TASK).optimizer, []
     state = transformation.init(jnp.zeros(()))
     for _ in range(11):  # under a constant gradient, Adam steps by the learning rate
         change, state = transformation.update(jnp.ones(()), state)

@@ -5,8 +5,11 @@ import json
 import pytest
 from conftest import assert_close
 
+from jaxpend.cli.tables import seeds_table
 from jaxpend.files import to_json
-from jaxpend.runs.seeds import seeds_table, summary
+from jaxpend.runs.statistics import summary
+
+HEADINGS = {"start": "start", "sac": "after SAC", "snes": "after SNES"}
 
 
 def results(scores):
@@ -19,7 +22,7 @@ def results(scores):
 
 def test_a_summary_keeps_the_seed_axis_and_has_its_statistics(capfd):
     scores = [0.0, 0.5, 0.5, 0.6, 0.6, 0.6, 0.7, 0.9]
-    group = summary(results(scores))
+    group = summary(results(scores), HEADINGS)
     assert (group["robot"], group["seeds"]) == ("acrobot", [*range(3, 11)])
     assert list(group["stages"]) == ["sac", "snes"]
     found = group["stages"]["sac"]
@@ -36,7 +39,7 @@ def test_a_summary_keeps_the_seed_axis_and_has_its_statistics(capfd):
 
 
 def test_one_seed_has_no_interval(capfd):
-    group = summary(results([0.25]))
+    group = summary(results([0.25]), HEADINGS)
     assert group["stages"]["sac"]["interval"] is None
     assert group["stages"]["sac"]["interquartile_mean"] == 0.25
     json.loads(to_json(group), parse_constant=pytest.fail)

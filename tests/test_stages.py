@@ -1,13 +1,29 @@
-"""Stages: what candidates are compared by."""
+"""Stages: what candidates are compared by, and that a new stage is one class."""
 
+import dataclasses
+import json
+import signal
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import shipped_network
+from conftest import refused, shipped_network
+from training_runs import events_of, rows_of
 
-from jaxpend.config import GradientConfig, SNESConfig
+from jaxpend import Policy, save_policy, stage
+from jaxpend.boards import v2
+from jaxpend.config import GradientConfig, SNESConfig, SNESRun
+from jaxpend.gradient import Gradient
+from jaxpend.pytree import Pytree, pytree
+from jaxpend.report import page
+from jaxpend.runs.reader import find, listing, remarks
 from jaxpend.score import Criteria, nominal, score_v2
-from jaxpend.train import stages
+from jaxpend.snes import SNES
+from jaxpend.train import train
+from jaxpend.train.interrupt import Stopped
+
+TASK = v2("pendubot").task
 
 
 @pytest.fixture
@@ -15,40 +31,171 @@ def met(monkeypatch):
     """How many scenarios were met; three of four of them end with score 1, the others with 0."""
     counts = []
 
-    def imperfect(controller, plant, key, count):
+    def imperfect(controller, task, key, count):
         counts.append(count)
         return Criteria(*jnp.zeros((9, count)), success=jnp.arange(count) % 4 > 0)
 
-    monkeypatch.setattr(stages, "imperfect", imperfect)
-    stages._validation.clear_cache()
+    monkeypatch.setattr(stage, "imperfect", imperfect)
+    stage._validation.clear_cache()
     yield counts
-    stages._validation.clear_cache()
+    stage._validation.clear_cache()
 
 
 @pytest.mark.parametrize(
     ("kind", "config"),
     [
-        (stages.Gradient, GradientConfig(scenarios=2, scenario_weight=0.25, validation=8)),
-        (stages.Gradient, GradientConfig()),
-        (stages.SNES, SNESConfig(population=2, action_noise=0.0)),
+        (Gradient, GradientConfig(scenarios=2, scenario_weight=0.25, validation=8)),
+        (Gradient, GradientConfig()),
+        (SNES, SNESConfig(population=2, action_noise=0.0)),
     ],
 )
 def test_candidates_are_compared_by_score_and_by_scenarios_that_stay_the_same(met, kind, config):
     policy = shipped_network()
-    stage = kind(config, policy, "pendubot")
-    row, candidates = stage.judge(stage.start(0, policy), {})
-    expected = score = float(score_v2(nominal(policy, "pendubot")))
+    search = kind(config, policy, TASK)
+    row, candidates = search.judge(search.start(0, policy), {})
+    expected = score = float(score_v2(nominal(policy, TASK)))
     if config.scenarios:
         expected = 0.75 * score + 0.25 * 0.75
     assert met == ([8] if config.scenarios else [])
     for _, worth in candidates:
         np.testing.assert_allclose(worth, expected, rtol=1e-5)
-    found = row["score"] if kind is stages.Gradient else row["mean_score"]
+    found = row["score"] if kind is Gradient else row["mean_score"]
     np.testing.assert_allclose(found, score, rtol=1e-5)
 
 
 def test_scenarios_count_in_either_search(met):
     for config in (GradientConfig(scenarios=1), SNESConfig(scenarios=1)):
         weight = config.scenario_weight
-        assert stages.value(config, None, 0.5, "acrobot") == 0.5 * (1 - weight) + 0.75 * weight
+        assert stage.value(config, None, 0.5, TASK) == 0.5 * (1 - weight) + 0.75 * weight
     assert met == [256]  # compiled once for both
+
+
+# --- a new stage ---------------------------------------------------------------------------
+
+
+@pytree
+class Scale(Pytree):
+    """How often the policy has been changed, and the policy."""
+
+    policy: Policy
+    done: jax.Array
+    key: jax.Array
+
+
+class Shrinking(stage.Stage[Policy, Scale, Policy]):
+    """A stage that nobody else knows: weights shrink, which makes a good policy worse."""
+
+    name, title, unit, column = "shrinking", "Shrinking", "rounds", "round"
+    heading, scores = "after shrinking", ("judged",)
+    charts = (stage.Chart("Judgement", {"best so far": "best", "now": "judged"}, "v2 score"),)
+    total = 3
+
+    def __init__(self, policy, task):
+        self.policy, self.task = policy, task
+
+    @classmethod
+    def of(cls, run, start, task):
+        return cls(start, task) if hasattr(run, "snes") else None
+
+    def start(self, seed, before):
+        return Scale(before, jnp.asarray(0), jax.random.key(seed))
+
+    def like(self):
+        return jax.eval_shape(lambda policy: self.start(0, policy), self.policy)
+
+    def policy_like(self):
+        return self.policy
+
+    def done(self, state):
+        return int(state.done)
+
+    def advance(self, states):
+        shrunk = [jax.tree.map(lambda leaf: 0.9 * leaf, state.policy) for state in states]
+        return [
+            (state.replace(policy=policy, done=state.done + 1), {"size": jnp.asarray(0.9)})
+            for state, policy in zip(states, shrunk, strict=True)
+        ]
+
+    def judge(self, state, metrics):
+        score = float(self.task.score(nominal(state.policy, self.task)))
+        return {"judged": score, **metrics}, [(state.policy, score)]
+
+    def note(self, row):
+        return f"judged {row['judged']:.2f}"
+
+    def watched(self, state):
+        return state.policy
+
+    def outcome(self, state, best):
+        return best
+
+
+def test_a_new_stage_is_one_class(tmp_path, monkeypatch, capfd):
+    """It is trained, resumed, listed, reported and in TensorBoard, and no table knows it."""
+    save_policy(tmp_path / "start.npz", shipped_network())
+    run = SNESRun(policy=str(tmp_path / "start.npz"), runs=str(tmp_path / "runs"), run="new")
+    run = dataclasses.replace(run, tensorboard=True)
+    looks = iter([None, None, Stopped(signal.SIGINT)])
+
+    def look():
+        if (now := next(looks, None)) is not None:
+            raise now
+
+    monkeypatch.setattr("jaxpend.train.loop.stop_if_asked", look)
+    with pytest.raises(Stopped, match="stopped in Shrinking at 2 of 3 rounds"):
+        train(run, kinds=(Shrinking,))
+    (entry,) = listing(tmp_path / "runs")
+    assert (entry["stages"], entry["at"]) == (["shrinking"], "Shrinking 2/3")
+    result = train(run, kinds=(Shrinking,))
+    assert result["shrinking"]["score"] == result["score"] > 0.5
+    said = capfd.readouterr().err.replace("\n", " ")
+    assert f"best {result['score']:.4f}, kept since 0" in said
+    folder = tmp_path / "runs" / "new"
+    # TensorBoard has what the metrics have, over the column of the stage.
+    rows = rows_of(folder)
+    assert [row["round"] for row in rows] == [1, 2, 3]
+    steps = [step for tag, step, _ in events_of(folder) if tag == "shrinking/judged"]
+    assert steps == [1, 2, 3]
+    (found,) = find(folder)
+    assert list(found.results) == ["start", "after shrinking"]
+    assert found.policy == str(folder / "policy.npz")
+    assert remarks([found]) == []
+    text = page.write([found], folder, title="new", robustness=False).read_text()
+    for words in ("<h3>Shrinking</h3>", "Shrinking: Judgement", "after shrinking"):
+        assert words in text
+
+
+def test_progress_says_whether_the_best_is_new(tmp_path, capfd):
+    save_policy(tmp_path / "start.npz", shipped_network())
+    run = SNESRun(policy=str(tmp_path / "start.npz"), runs=str(tmp_path), run="growing")
+
+    class Growing(Shrinking):
+        def advance(self, states):
+            return [(s.replace(done=s.done + 1), {"size": jnp.asarray(1.0)}) for s in states]
+
+        def judge(self, state, metrics):
+            row, _ = super().judge(state, metrics)
+            return row, [(state.policy, min(self.done(state), 2) / 10)]
+
+    train(run, kinds=(Growing,))
+    said = [line for line in capfd.readouterr().err.splitlines() if line.startswith("Shrinking ")]
+    notes = [line.partition("  best ")[2] for line in said]
+    assert notes == ["0.1000, improved", "0.2000, improved", "0.2000, kept since 2"]
+
+
+def test_a_plant_file_that_has_changed_makes_another_run(tmp_path):
+    save_policy(tmp_path / "start.npz", shipped_network())
+    plant, parameters = tmp_path / "plant.json", dict(TASK.parameters)
+    plant.write_text(json.dumps(parameters))
+    run = SNESRun(policy=str(tmp_path / "start.npz"), runs=str(tmp_path), run="heavy")
+    run = dataclasses.replace(run, plant=str(plant))
+    train(run, kinds=(Shrinking,))
+    folder = tmp_path / "heavy"
+    assert json.loads((folder / "run.json").read_text())["plant"] == parameters
+    (folder / "result.json").unlink()
+    moved = plant.rename(tmp_path / "moved.json")
+    train(dataclasses.replace(run, plant=str(moved)), kinds=(Shrinking,))  # the same plant
+    name = next(iter(parameters))
+    moved.write_text(json.dumps(parameters | {name: 2 * parameters[name]}))
+    with refused(f"{folder} holds a run with plant.{name} {parameters[name]}, not"):
+        train(dataclasses.replace(run, plant=str(moved)), kinds=(Shrinking,))

@@ -1,10 +1,10 @@
 """TensorBoard events: the rows of the metrics, each once."""
 
 import json
-import struct
 import sys
 
 import pytest
+from training_runs import events_of
 
 from jaxpend import JaxpendError
 from jaxpend.config import SNESRun
@@ -15,25 +15,14 @@ ROWS = [
     {"stage": "sac", "seconds": 0.5, "env_steps": 64, "updates": 8, "score": 0.25, "loss": None},
     {"stage": "sac", "seconds": 1.5, "env_steps": 128, "updates": 16, "score": 0.5, "loss": 2.0},
     {"stage": "snes", "seconds": 2.5, "generation": 2, "mean_fitness": 0.75},
+    {"stage": "climb", "seconds": 3.5, "metres": 7, "score": 0.5},  # a stage of one's own
 ]
+COLUMNS = {"sac": "env_steps", "snes": "generation", "climb": "metres"}
 SCALARS = [
     ("sac/updates", 64, 8.0), ("sac/score", 64, 0.25),
     ("sac/updates", 128, 16.0), ("sac/score", 128, 0.5), ("sac/loss", 128, 2.0),
-    ("snes/mean_fitness", 2, 0.75),
+    ("snes/mean_fitness", 2, 0.75), ("climb/score", 7, 0.5),
 ]  # fmt: skip
-
-
-def scalars(run):
-    """(tag, step, value) of every scalar in the one event file of a run folder."""
-    from tensorboardX.proto.event_pb2 import Event
-
-    (path,) = (run / "tensorboard").iterdir()
-    data, found = path.read_bytes(), []
-    while data:  # TFRecord: length, its checksum, the event, its checksum
-        (size,) = struct.unpack("<Q", data[:8])
-        event, data = Event.FromString(data[12 : 12 + size]), data[16 + size :]
-        found += [(value.tag, event.step, value.simple_value) for value in event.summary.value]
-    return found
 
 
 def write(run, rows):
@@ -43,25 +32,32 @@ def write(run, rows):
 
 def test_every_row_is_on_disk_once_whatever_went_before(tmp_path):
     write(tmp_path, ROWS[:2])
-    events = Events(tmp_path)
-    assert scalars(tmp_path) == SCALARS[:5]
-    events.add(ROWS[2])
-    assert scalars(tmp_path) == SCALARS
+    events = Events(tmp_path, COLUMNS)
+    assert events_of(tmp_path) == SCALARS[:5]
+    for row in ROWS[2:]:
+        events.add(row)
+    assert events_of(tmp_path) == SCALARS
     (path,) = (tmp_path / "tensorboard").iterdir()
-    path.rename(path.with_name("events.out.tfevents.1.before"))
+    path.rename(path.with_name("events.out.tfevents.1.before.jaxpend"))
+    own = tmp_path / "tensorboard" / "events.out.tfevents.1.mine"
+    own.write_text("mine")
     write(tmp_path, ROWS[:1])  # killed, and taken up again from an older checkpoint
-    events = Events(tmp_path)
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('[]\n{"stage": "other", "at": 3}\n{"stage": "sac"}\n{"sta')
+    events = Events(tmp_path, COLUMNS)
     for row in ROWS[1:]:
         events.add(row)
-    assert scalars(tmp_path) == SCALARS
+    assert events_of(tmp_path) == SCALARS
+    assert own.read_text() == "mine"
 
 
 def test_a_run_folder_writes_events_only_if_asked(tmp_path):
     config = SNESRun(tensorboard=True)
-    folder = RunFolder(tmp_path / "asked", config, "command")
+    about = {"stages": [{"name": name, "column": column} for name, column in COLUMNS.items()]}
+    folder = RunFolder(tmp_path / "asked", config, "command", about)
     for row in ROWS:
         folder.log(**{name: value for name, value in row.items() if value is not None})
-    assert scalars(folder.path) == SCALARS
+    assert events_of(folder.path) == SCALARS
     folder = RunFolder(tmp_path / "not", SNESRun(), "command")
     folder.log(**ROWS[2])
     assert not (folder.path / "tensorboard").exists()

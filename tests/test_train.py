@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import shipped_network
-from training_runs import OPTIONS, arrays_of, result_of, rows_of, training
+from training_runs import OPTIONS, arrays_of, events_of, result_of, rows_of, training
 
 from jaxpend import Policy, cli, designs, load_policy, save_policy
+from jaxpend.boards import v2
 from jaxpend.config import GradientConfig, GradientRun, SACRun, SNESConfig, SNESRun, TrainRun
 from jaxpend.controllers import Guarded, load_controller
 from jaxpend.controllers.catalogue import build
@@ -27,6 +28,7 @@ from jaxpend.score import official
 from jaxpend.train.interrupt import Stopped
 from jaxpend.train.loop import stages_of, train
 
+TASK = v2("pendubot").task
 CRITERIA = {
     "swingup_time", "energy", "tau_cost", "tau_smoothness", "velocity_cost", "max_tau",
     "integ_tau",
@@ -75,7 +77,7 @@ def test_a_run_leaves_its_configuration_metrics_policies_and_result(whole_run):
     for stage in ("sac", "snes"):
         assert all(0 <= row.get("score", 0) < 1 for row in rows_of(folder, stage))
     # Progress from the first moment on, the results last.
-    words = ["imitating demonstrations: compiling", "SAC 64/1,024", "SNES 2/12", "after SNES"]
+    words = ["Imitation: compiling", "SAC 64/1,024", "SNES 2/12", "after SNES"]
     places = [said.replace("\n", "").index(word) for word in [*words, str(folder.name)]]
     assert places[:-1] == sorted(places[:-1])
 
@@ -104,7 +106,7 @@ def wait(process, until):
     """Wait for something that a process does before it ends."""
     while not until():
         assert process.poll() is None, process.stderr.read()
-        time.sleep(0.01)
+        time.sleep(0.001)  # a checkpoint is written in some milliseconds
 
 
 def test_a_run_killed_again_and_again_ends_as_one_that_never_was(whole_run):
@@ -114,7 +116,7 @@ def test_a_run_killed_again_and_again_ends_as_one_that_never_was(whole_run):
 
     def reached(stage, count, writing=False):
         def now():
-            tmp = not writing or any((folder / "checkpoints").glob("*tmp*"))
+            tmp = not writing or any((folder / "checkpoints").glob(".*jaxpend-tmp-*"))
             return tmp and len(rows_of(folder, stage)) >= count
 
         return now
@@ -207,25 +209,34 @@ def test_snes_starts_from_a_policy_file(whole_run, monkeypatch, tmp_path):
     assert {"policy.npz", "snes_best.npz", "snes_last.npz"} <= names
 
 
+def scalars(folder):
+    """Steps of every scalar in the TensorBoard events of a run."""
+    steps = {}
+    for tag, step, _ in events_of(folder):
+        steps.setdefault(tag, []).append(step)
+    return steps
+
+
 def test_the_gradient_starts_from_a_policy_file(monkeypatch, tmp_path):
     start, folder = tmp_path / "start.npz", tmp_path / "fine"
     save_policy(start, shipped_network(bias=0.05))
     options = ["--gradient.steps", "5", "--gradient.chunk", "3", "--gradient.learning-rate", "3e-5"]
-    options += ["--policy", start, "--runs", tmp_path, "--run", "fine"]
+    options += ["--policy", start, "--runs", tmp_path, "--run", "fine", "--tensorboard"]
     run_command(monkeypatch, GradientRun, *options)
     result = json.loads((folder / "result.json").read_text())
     assert result["score"] == result["gradient"]["score"] > result["start"]["score"]
     assert [row["step"] for row in rows_of(folder, "gradient")] == [0, 3, 5]
+    assert scalars(folder)["gradient/score"] == [0, 3, 5]
     assert {"policy.npz", "gradient_best.npz"} <= {path.name for path in folder.iterdir()}
 
 
 def test_the_gradient_has_a_place_between_sac_and_snes_where_it_has_steps():
-    assert list(stages_of(TrainRun(), None)) == ["sac", "snes"]
-    stages = stages_of(TrainRun(gradient=GradientConfig(steps=3)), None)
+    assert list(stages_of(TrainRun(), None, TASK)) == ["sac", "snes"]
+    stages = stages_of(TrainRun(gradient=GradientConfig(steps=3)), None, TASK)
     assert list(stages) == ["sac", "gradient", "snes"]
     # What a checkpoint is read into is what a run has.
     stage, policy = stages["gradient"], load_policy("pendubot")
-    stage = type(stage)(stage.config, policy, "pendubot")
+    stage = type(stage)(stage.config, policy, TASK)
     shapes = lambda tree: jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)  # noqa: E731
     assert shapes(stage.like()) == shapes(stage.start(0, policy))
 

@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import signal
+import struct
 import subprocess
 import sys
 
@@ -54,7 +55,7 @@ def rows_of(folder, stage=None):
 def result_of(folder):
     """The result, without the time."""
     result = json.loads((folder / "result.json").read_text())
-    for stage in {"sac", "snes"} & result.keys():
+    for stage in {"sac", "gradient", "snes"} & result.keys():
         del result[stage]["seconds"]
     return result
 
@@ -63,3 +64,16 @@ def arrays_of(path):
     """The arrays of a policy file."""
     with np.load(path) as file:
         return {name: file[name] for name in file if name != "header"}
+
+
+def events_of(run):
+    """(tag, step, value) of every scalar in the one event file that a run has written."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    (path,) = (run / "tensorboard").glob("*.jaxpend")
+    data, found = path.read_bytes(), []
+    while data:  # TFRecord: length, its checksum, the event, its checksum
+        (size,) = struct.unpack("<Q", data[:8])
+        event, data = Event.FromString(data[12 : 12 + size]), data[16 + size :]
+        found += [(value.tag, event.step, value.simple_value) for value in event.summary.value]
+    return found

@@ -60,7 +60,7 @@ def snes(config: SNESRun, command: str) -> None:
 def execute(config: Run, command: str) -> None:
     """``train.train``, then the score table, and where the results are."""
     board = _board(config.robot, config.plant, config.design)
-    from ..runs.reader import RESULTS
+    from ..runs.reader import read_run
     from ..terminal import console
     from ..train import train
     from .tables import score_table, seeds_table
@@ -69,7 +69,7 @@ def execute(config: Run, command: str) -> None:
     if config.seeds > 1:
         seeds_table(result)
     else:
-        score_table({RESULTS[k]: result[k] for k in RESULTS if k in result}, board)
+        score_table(read_run(config.folder).results, board)
     console.print(f"policy.npz, metrics and result are in [bold]{config.folder}[/bold]")
 
 
@@ -113,7 +113,7 @@ def report(run: Path, /, out: Path | None = None, robustness: bool = True) -> No
     """
     folder = out or (run if run.is_dir() else Path("runs") / run.stem)
     check_folder(folder)
-    from ..runs.record import find, remarks
+    from ..runs.reader import find, remarks
     from ..terminal import console
 
     found = find(run)

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich import box
+from rich.markup import escape
 from rich.table import Table
 
-from ..runs.reader import RESULTS
 from ..terminal import console
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def score_table(results: Mapping[str, Mapping], board: "Board") -> None:
     for name in results:
         table.add_column(name, justify="right")
     table.add_row("score", *(f"[bold]{r['score']:.4f}[/bold]" for r in results.values()))
-    table.add_row("success", *("yes" if r["success"] else "no" for r in results.values()))
+    table.add_row("success", *("yes" if r.get("success") else "no" for r in results.values()))
     for key, (heading, unit, form) in HEADINGS.items():
         cells = (format(r["criteria"][key], form) for r in results.values())
         table.add_row(f"{heading} \\[{unit}]", *cells)
@@ -103,7 +103,7 @@ def runs_table(entries: Sequence[Mapping[str, Any]]) -> None:
         state = f"[{COLOURS[run['state']]}]{run['state']}[/]"
         date = datetime.datetime.fromisoformat(run["changed"])
         table.add_row(
-            run["run"], run["robot"] or "", ", ".join(s.upper() for s in run["stages"]),
+            escape(run["run"]), run["robot"] or "", ", ".join(s.upper() for s in run["stages"]),
             "" if seed is None else str(seed),
             f"{state}: {run['at']}" if run["at"] else state,
             "" if run["score"] is None else f"{run['score']:.4f}",
@@ -116,14 +116,14 @@ def runs_table(entries: Sequence[Mapping[str, Any]]) -> None:
 
 
 def seeds_table(group: Mapping[str, Any]) -> None:
-    """Print a ``runs.seeds.summary``."""
+    """Print a ``runs.statistics.summary``."""
     table = Table(title=f"{group['robot']}: official v2 score of {len(group['seeds'])} seeds")
     headings = ("", "median", "interquartile mean", "95 %", "lowest to highest")
     for heading in headings:
         table.add_column(heading, justify="right" if heading else "left")
-    for name, found in group["stages"].items():
+    for found in group["stages"].values():
         ends = (found["interval"], (found["lowest"], found["highest"]))
         points = (f"{found[key]:.4f}" for key in ("median", "interquartile_mean"))
         ranges = ("" if e is None else f"{e[0]:.4f} to {e[1]:.4f}" for e in ends)
-        table.add_row(RESULTS[name], *points, *ranges)
+        table.add_row(found["heading"], *points, *ranges)
     console.print(table)

@@ -16,32 +16,27 @@ __all__ = ["gif", "keyframes"]
 EVERY = 5  # of the 500 Hz samples the page plays one in five
 
 
-def keyframes(t, x, u, joint: int, up: float | None) -> dict[str, Any]:
+def keyframes(t, x, u, points, joint: int, up: float | None) -> dict[str, Any]:
     """What the page needs to play a run, thinned out and rounded.
 
     Args:
-        t: (n,) s.
+        t: (n,) s, of at least one sample.
         x: (n, 4) rad, rad/s.
         u: (n - 1, 2) N m.
+        points: (n, 2, 2) m, elbow and end effector, x and y, as ``plant.forward_kinematics``.
         joint: the driven one.
         up: s, the swing-up time; None without success.
     """
-    last = len(u) - 1
     picked = np.arange(0, len(t), EVERY)
+    torque = np.append(u[:, joint], u[-1:, joint] if len(u) else 0.0)
     return {
-        "dt": float(t[EVERY]),
+        "dt": float(t[EVERY]) if len(t) > EVERY else 0.01,
         "theta1": np.round(x[picked, 0], 4).tolist(),
         "theta2": np.round(x[picked, 1], 4).tolist(),
-        "torque": np.round(u[np.minimum(picked, last), joint], 3).tolist(),
+        "joints": np.round(points[picked].reshape(-1, 4), 4).tolist(),
+        "torque": np.round(torque[picked], 3).tolist(),
         "up": up,
     }
-
-
-def _points(x: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Elbow and end effector (n, 2, 2), m, y upwards, for states (n, 4)."""
-    angles = np.stack([x[:, 0], x[:, 0] + x[:, 1]], axis=1)
-    arms = np.stack([np.sin(angles), -np.cos(angles)], axis=2) * length[None, :, None]
-    return np.cumsum(arms, axis=1)
 
 
 def _dashed(draw, y: float, width: float, colour: str, dash: float, line: int) -> None:
@@ -49,20 +44,22 @@ def _dashed(draw, y: float, width: float, colour: str, dash: float, line: int) -
         draw.line([(start, y), (start + dash, y)], fill=colour, width=line)
 
 
-def _frame(points, trail, length, time: float, size: int) -> Image.Image:
+def _frame(points, trail, reach: float, height: float, time: float, size: int) -> Image.Image:
     """One picture, drawn twice as large and scaled down, which smooths its edges."""
     big = 2 * size
     image = Image.new("RGB", (big, big), PALETTE["paper"])
     draw = ImageDraw.Draw(image)
-    reach = length.sum()
-    place = lambda p: (big / 2 + 0.44 * big / reach * p[0], big / 2 - 0.44 * big / reach * p[1])  # noqa: E731
-    above = points[1, 1] > 0.9 * reach
-    line = PALETTE["three" if above else "muted"]
-    _, y = place((0, 0.9 * reach))
+
+    def place(p) -> tuple[float, float]:
+        unit = 0.44 * big / reach
+        return big / 2 + unit * p[0], big / 2 - unit * p[1]
+
+    line = PALETTE["three" if points[1, 1] > height * reach else "muted"]
+    _, y = place((0, height * reach))
     _dashed(draw, y, big, line, big / 60, max(big // 240, 1))
     path = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
     font = ImageFont.truetype(str(path), big // 24)
-    draw.text((big * 0.02, y + big * 0.012), "0.9 line", fill=line, font=font)
+    draw.text((big * 0.02, y + big * 0.012), f"{height:g} line", fill=line, font=font)
     draw.text(
         (big * 0.98, big * 0.95), f"{time:.2f} s", fill=PALETTE["ink"], font=font, anchor="rs"
     )
@@ -76,23 +73,27 @@ def _frame(points, trail, length, time: float, size: int) -> Image.Image:
     return image.resize((size, size), Image.Resampling.LANCZOS)
 
 
-def gif(path: Path, t, x, length, *, end: float, size: int = 320, rate: int = 25) -> None:
+def gif(
+    path: Path, t, points, reach: float, height: float, *, end: float, size: int = 320,
+    rate: int = 25,
+) -> None:  # fmt: skip
     """Write the run up to ``end`` s as a GIF that repeats, atomically.
 
     Args:
         path: of the file.
-        t, x: (n,) s and (n, 4) rad, rad/s.
-        length: (2,) m, of the links.
+        t: (n,) s, evenly spaced.
+        points: (n, 2, 2) m, elbow and end effector, x and y, as ``plant.forward_kinematics``.
+        reach: m, what the end effector reaches when it is stretched.
+        height: the line that it has to cross, as a fraction of ``reach``.
         end: s.
         size: pixels on a side.
         rate: frames per second.
     """
-    length, points = np.asarray(length), _points(x, np.asarray(length))
-    step = t[1] - t[0]
+    step = t[1] - t[0] if len(t) > 1 else 1 / rate
     picked = np.round(np.arange(0, end, 1 / rate) / step).astype(int)
     back = round(0.6 / step)
     images = [
-        _frame(points[k], points[max(k - back, 0) : k + 1 : 5, 1], length, t[k], size)
+        _frame(points[k], points[max(k - back, 0) : k + 1 : 5, 1], reach, height, t[k], size)
         for k in picked[picked < len(t)]
     ]
     # One palette of all the colours there are, from pictures with and without each of them.

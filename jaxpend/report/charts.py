@@ -118,15 +118,24 @@ def draw_torque(axes, t, u, joint: int, limit: float, end: float, up: float | No
     axes.set_title("Torque")
 
 
-def draw_height(axes, t, x, length, end: float, up: float | None = None) -> None:
-    """Height of the end effector above joint 1, and the line at 0.9 of what it can reach."""
-    shown, reach = t <= end, length[0] + length[1]
-    y = -length[0] * np.cos(x[:, 0]) - length[1] * np.cos(x[:, 0] + x[:, 1])
+def draw_height(
+    axes, t, y, reach: float, height: float, end: float, up: float | None = None
+) -> None:
+    """Height of the end effector over time, and the line that it has to cross.
+
+    Args:
+        axes: to draw on.
+        t, y: (n,) s, and m above joint 1.
+        reach: m, what it reaches when it is stretched.
+        height: the line, as a fraction of ``reach``.
+        end, up: s, of the time axis and of the swing-up; None without success.
+    """
+    shown = t <= end
     axes.plot(t[shown], y[shown], color=PALETTE["ink"])
-    _goal(axes, 0.9 * reach, "three")
+    _goal(axes, height * reach, "three")
     axes.annotate(
-        "0.9 line", (1, 0.9 * reach), xycoords=("axes fraction", "data"), ha="right",
-        xytext=(0, -3), textcoords="offset points", va="top", fontsize=10,
+        f"{height:g} line", (1, height * reach), xycoords=("axes fraction", "data"),
+        ha="right", xytext=(0, -3), textcoords="offset points", va="top", fontsize=10,
         color=PALETTE["three"],
     )  # fmt: skip
     axes.set_ylim(-1.12 * reach, 1.12 * reach)
@@ -166,7 +175,7 @@ def _thousands(value: float, _position: int = 0) -> str:
 
 
 def _calm(axes, least: float = 0.01) -> None:
-    """No axis spans less than this share of its values: noise is not to look like news."""
+    """Make an axis span at least this share of its values, so that noise does not fill it."""
     low, high = axes.get_ylim()
     missing = least * max(abs(low), abs(high)) - (high - low)
     if missing > 0:

@@ -1,25 +1,25 @@
 """Pictures, and the CSV and JSON files beside them. Imported only by commands that draw.
 
 A chart is a function that draws on the axes it is given: alone, the width of a phone, for the
-page of a report (``panel`` and ``svg``), or beside others for a PNG file (``stack``).
+page of a report (``panel`` and ``svg``), or beside others for a PNG file (``stack``). Figures are
+objects that only this package holds: matplotlib's backend and the user's settings stay as they are.
 """
 
 import csv
 import io
 import json
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
-
-matplotlib.use("Agg")
 import numpy as np
 from matplotlib.figure import Figure
 
+from ..boards import CRITERIA
 from ..files import to_json, write_atomically
-from ..robustness import CRITERIA
 from ..variations import VARIATIONS
 
 __all__ = [
@@ -61,7 +61,10 @@ styled = matplotlib.rc_context(STYLE)
 def save(figure: Figure, path: Path, dpi: int = 150) -> None:
     """Write a figure as PNG, atomically."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
+    with warnings.catch_warnings():
+        # A name may have characters that the font does not have; boxes stand for them.
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        figure.savefig(buffer, format="png", dpi=dpi)
     write_atomically(path, buffer.getvalue())
 
 
@@ -104,7 +107,7 @@ def stack(
     figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
     for number, draw in enumerate(draws):
         draw(figure.add_subplot(rows, columns, number + 1))
-    figure.suptitle(title, fontweight="bold")
+    figure.suptitle(title, fontweight="bold", parse_math=False)
     return figure
 
 
@@ -112,12 +115,13 @@ def stack(
 
 
 def _bars(axes, result: dict[str, Any], first: bool) -> None:
-    """The six scores and the overall one, with the range over keys as whiskers."""
-    over, names = result["over_keys"], list(reversed(CRITERIA))
-    titles = ["Overall", *(CRITERIA[name] for name in names)]
-    values = [result["overall"], *(result["scores"][name] for name in names)]
-    ranges = [over["overall"], *(over["scores"].get(n, [result["scores"][n]]) for n in names)]
-    colours = [PALETTE["ink"]] + [PALETTE["one"]] * len(CRITERIA)
+    """The six scores and the overall one: medians over keys, with the range as whiskers."""
+    over, scores = result["over_keys"], result["scores"]
+    names = list(reversed(scores))
+    titles = ["Overall", *(CRITERIA.get(name, name) for name in names)]
+    values = [result["overall"], *(scores[name] for name in names)]
+    ranges = [over["overall"], *(over["scores"].get(n, [scores[n]]) for n in names)]
+    colours = [PALETTE["ink"]] + [PALETTE["one"]] * len(names)
     axes.barh(range(len(values)), values, color=colours, height=0.7)
     for y, (value, spread) in enumerate(zip(values, ranges, strict=True)):
         if len(spread) > 1:
@@ -138,14 +142,14 @@ def _bars(axes, result: dict[str, Any], first: bool) -> None:
 
 
 def _strips(axes, result: dict[str, Any], first: bool, margin: float = 0.18) -> Any:
-    """One row a grid: every value coloured by the fraction of its runs that succeed.
+    """One row a grid: every value coloured by the fraction of the first key's runs that succeed.
 
     ``margin`` is the room for the ends of a grid, in widths of a row.
     """
     rows = [
-        (name, grid)
-        for criterion in CRITERIA
-        for name, grid in result["criteria"][criterion]["grids"].items()
+        (grid.get("variation", name), grid)
+        for criterion in result["criteria"].values()
+        for name, grid in criterion["grids"].items()
     ]
     for y, (name, grid) in enumerate(rows):
         success, values = np.array(grid["success"]), grid["values"]
@@ -241,7 +245,7 @@ def _table(result: dict[str, Any]) -> str:
         for name, grid in found["grids"].items():
             columns = [grid["values"], grid["success"], *([grid["performance"]] if scored else [])]
             for value, *numbers in zip(*columns, strict=True):
-                unit = VARIATIONS[name].unit
+                unit = VARIATIONS[grid.get("variation", name)].unit
                 writer.writerow([result["robot"], criterion, name, unit, value, *numbers])
     return text.getvalue()
 

@@ -1,10 +1,13 @@
 """Run folders on disk."""
 
+import contextlib
 import fcntl
 import json
 import os
+import re
 import time
 import weakref
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,12 +16,13 @@ from .. import __version__
 from . import tensorboard
 from ..config_files import differing_field, to_mapping
 from ..errors import JaxpendError
-from ..files import to_json, write_atomically
+from ..files import TEMPORARY, remove_temporary, to_json, write_atomically
+from .reader import read_result, seed_folders
 
 if TYPE_CHECKING:
     from ..controller import Controller
 
-__all__ = ["RunFolder"]
+__all__ = ["RunFolder", "refuse_foreign", "refuse_no_group"]
 
 
 def _field(values: Any, dotted: str) -> Any:
@@ -27,29 +31,87 @@ def _field(values: Any, dotted: str) -> Any:
     return values
 
 
-# Where a run is, and how it is kept, may change when it goes on; what it computes may not.
+# Where a run is, and how it is kept, may change when it goes on; what it computes must not. The
+# plant is compared by its parameters.
 MAY_DIFFER = (
     "run", "runs", "seeds", "vmap", "checkpoint", "on_divergence", "max_rollbacks", "tensorboard",
+    "plant", "design",
 )  # fmt: skip
+INSTEAD = "choose another name or remove the folder"
+
+
+def refuse_foreign(path: Path) -> None:
+    """Raise ``JaxpendError`` if a folder holds files, but no run: they are a user's own."""
+    if not path.is_dir() or (path / "config.json").exists():
+        return
+    # A process killed at the very beginning leaves no more than these.
+    begun = {p for p in path.iterdir() if p.name == ".lock" or TEMPORARY.fullmatch(p.name)}
+    with contextlib.suppress(JaxpendError):  # not ours
+        if isinstance(_read(path / "run.json").get("stages"), list):
+            begun.add(path / "run.json")
+    if set(path.iterdir()) - begun:
+        text = f"{path} is not empty and holds no run; choose another name"
+        raise JaxpendError(text)
+
+
+def refuse_no_group(path: Path) -> None:
+    """Raise ``JaxpendError`` if a folder for several seeds holds something else."""
+    if not path.is_dir() or seed_folders(path):
+        return
+    if any(not re.fullmatch(r"seed\d+", part.name) for part in path.iterdir()):
+        text = f"{path} is not empty and holds no runs of several seeds; choose another name"
+        raise JaxpendError(text)
+
+
+def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Fields of nested mappings, dotted, with their values."""
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
+
+
+def changed(config: Any) -> dict[str, list[Any]]:
+    """Fields of a run's configuration, dotted, that are not as by default: value and default."""
+    same = {"robot": config.robot} if hasattr(config, "robot") else {}
+    default, given = (dict(_flat(to_mapping(c))) for c in (type(config)(**same), config))
+    return {k: [v, default.get(k)] for k, v in given.items() if k not in default or v != default[k]}
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """What a JSON file says; nothing if it is not there."""
+    try:
+        value = json.loads(path.read_text())
+    except FileNotFoundError:
+        return {}
+    except (ValueError, RecursionError):
+        value = None
+    if not isinstance(value, dict):
+        raise JaxpendError(f"{path} is damaged; {INSTEAD}")
+    return value
 
 
 class RunFolder:
     """Where a run leaves its configuration, metrics, policies and result.
 
-    ``config.json``, ``run.json`` (version and command), ``metrics.jsonl`` (one row an evaluation),
-    ``*.npz`` policies, ``checkpoints`` while it is not finished and, at the end, ``result.json``.
-    All but the metrics are written atomically.
+    ``config.json``, ``run.json`` (version, command, what differs from the defaults, and what it is
+    ``about``: its stages, its plant), ``metrics.jsonl`` (one row an evaluation), ``*.npz``
+    policies, ``checkpoints`` while it is not finished and, at the end, ``result.json``. All but
+    the metrics are written atomically.
 
     A new folder is made; one with a run of the same configuration is taken up again. As long as
     this object is open, no other process can open a run in the folder that is not finished.
 
     Raises:
-        JaxpendError: there is a run of another configuration or version, or another process
-            works on it. Nothing in the folder has changed then.
+        JaxpendError: there is a run of another configuration, plant or version, or files that
+            are no run, or another process works on it. Nothing in the folder has changed then.
     """
 
-    def __init__(self, path: str | Path, config: Any, command: str):
-        self.path, self.command = Path(path), command
+    def __init__(
+        self, path: str | Path, config: Any, command: str, about: Mapping[str, Any] | None = None
+    ):
+        self.path, self.command, self.about = Path(path), command, about or {}
         self._tensorboard = getattr(config, "tensorboard", False)
         self._events: tensorboard.Events | None = None
         if self._tensorboard:
@@ -61,39 +123,31 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             self._lock()
             self._check()  # again: another process may have made it meanwhile
-            for path in self.path.glob(".*.[0-9]*"):  # of a process killed in write_atomically
-                path.unlink()
+            remove_temporary(self.path)
         if not (self.path / "config.json").exists():
             made_by = {"version": __version__, "jax": version("jax"), "command": command}
-            self.write_json("run.json", made_by)
+            about = {"stages": [], "changed": changed(config), **self.about}
+            self.write_json("run.json", {**made_by, **about})
             self.write_json("config.json", self.config)  # last: it says that a run is here
 
     def _check(self) -> None:
+        refuse_foreign(self.path)
         if not (self.path / "config.json").exists():
             return
-        instead = "choose another name or remove the folder"
-        stored = self._read("run.json").get("version", "(unknown version)")
+        made_by = _read(self.path / "run.json")
+        stored = made_by.get("version", "(unknown version)")
         if stored != __version__:
-            text = f"{self.path} holds a run of jaxpend {stored}, this is {__version__}; {instead}"
+            text = f"{self.path} holds a run of jaxpend {stored}, this is {__version__}; {INSTEAD}"
             raise JaxpendError(text)
-        stored = self._read("config.json")
-        field = differing_field(stored, self.config, MAY_DIFFER)
+        stored, given = _read(self.path / "config.json"), self.config
+        field = differing_field(stored, given, MAY_DIFFER)
+        if field is None:
+            stored, given = ({"plant": about.get("plant")} for about in (made_by, self.about))
+            field = differing_field(stored, given)
         if field is not None:
-            there, here = to_json(_field(stored, field)), to_json(_field(self.config, field))
-            text = f"{self.path} holds a run with {field} {there}, not {here}; {instead}"
+            there, here = (to_json(_field(values, field)) for values in (stored, given))
+            text = f"{self.path} holds a run with {field} {there}, not {here}; {INSTEAD}"
             raise JaxpendError(text)
-
-    def _read(self, name: str) -> dict:
-        try:
-            value = json.loads((self.path / name).read_text())
-        except FileNotFoundError:
-            return {}
-        except ValueError:
-            value = None
-        if not isinstance(value, dict):
-            text = f"{self.path / name} is damaged; choose another name or remove the folder"
-            raise JaxpendError(text)
-        return value
 
     def _lock(self) -> None:
         # The system releases it when the process ends, however it ends.
@@ -122,7 +176,11 @@ class RunFolder:
     @property
     def result(self) -> dict | None:
         """What ``result.json`` says; None: the run is not finished."""
-        return self._read("result.json") or None
+        try:
+            return read_result(self.path / "result.json")
+        except JaxpendError:
+            text = f"{self.path / 'result.json'} is damaged; {INSTEAD}"
+            raise JaxpendError(text) from None
 
     @property
     def seconds(self) -> float:
@@ -160,7 +218,8 @@ class RunFolder:
         if self._events is not None:
             self._events.add(row)
         elif self._tensorboard:
-            self._events = tensorboard.Events(self.path)  # of all rows, this one too
+            columns = {stage["name"]: stage["column"] for stage in self.about.get("stages", ())}
+            self._events = tensorboard.Events(self.path, columns)  # of all rows, this one too
 
     def save(self, name: str, policy: "Controller", **provenance: Any) -> Path:
         """Write a policy or controller file with the command and configuration that made it."""

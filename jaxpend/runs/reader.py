@@ -1,6 +1,12 @@
-"""What run folders hold, read from their files alone."""
+"""What run folders hold, read from their files alone and without jax.
+
+A run says of its own stages what people want to see of them (``stage.Stage.about``, in
+``run.json``). Runs of version 0.1 say nothing; what can be shown of them is guessed from their
+configuration and metrics. Whatever is in the files, what cannot be read is one sentence.
+"""
 
 import contextlib
+import dataclasses
 import datetime
 import fcntl
 import json
@@ -12,34 +18,282 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import JaxpendError
+from ..robots import ROBOTS
 
-__all__ = ["RESULTS", "STAGES", "listing", "runs_table", "seed_folders"]
+__all__ = [
+    "RunRecord",
+    "StageRecord",
+    "find",
+    "listing",
+    "read_result",
+    "read_run",
+    "remarks",
+    "seed_folders",
+]
 
-# Stage -> column of the metrics that says how far it is, field of the configuration it goes to.
-STAGES = {
-    "sac": ("env_steps", "steps"),
-    "gradient": ("step", "steps"),
-    "snes": ("generation", "generations"),
-}
-# What ``result.json`` may have scores of, and how people call it.
-RESULTS = {
-    "start": "start",
-    "sac": "after SAC",
-    "gradient": "after the gradient",
-    "snes": "after SNES",
-}
+
+@dataclasses.dataclass(frozen=True)
+class StageRecord:
+    """What a run says of one of its stages, as in ``stage.Stage``."""
+
+    name: str
+    title: str
+    unit: str
+    column: str
+    total: int
+    heading: str
+    charts: tuple[tuple[str, dict[str, str], str, bool], ...]  # as in ``stage.Chart``
+    scores: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class RunRecord:
+    """What one run has left on disk so far."""
+
+    name: str
+    robot: str
+    config: dict[str, Any]  # empty for a policy without a run
+    stages: tuple[StageRecord, ...]
+    rows: list[dict[str, Any]]  # of metrics.jsonl, numbers only, in the order of the stages
+    result: dict[str, Any] | None  # None: not finished
+    policy: str | None  # path, or robot for what ships with the package; None: none yet
+    made_by: dict[str, Any] = dataclasses.field(default_factory=dict)  # see ``_made_by``
+
+    @property
+    def progress(self) -> dict[str, tuple[int, int]]:
+        """Name of a stage -> how far it is, and how far it is to go, which it may go beyond."""
+        done = {}
+        for stage in self.stages:
+            steps = [row[stage.column] for row in self.rows if row["stage"] == stage.name]
+            done[stage.name] = (min(max(steps, default=0), stage.total), stage.total)
+        return done
+
+    @property
+    def headings(self) -> dict[str, str]:
+        """Part of the result -> its heading: of what the run started from, and of its stages."""
+        return {"start": "start"} | {s.name: s.heading for s in self.stages if s.heading}
+
+    @property
+    def results(self) -> dict[str, dict[str, Any]]:
+        """Heading -> official result."""
+        result = self.result or {}
+        return {title: result[name] for name, title in self.headings.items() if name in result}
+
+
+# --- from files to values of the right types -----------------------------------------------
+
+
+class _Unreadable(JaxpendError):
+    """A file of a run that is not what it should be."""
+
+    def __init__(self, path: Path, what: str):
+        super().__init__(f"{path} is not {what}; the run cannot be read")
+        self.file = path.name
 
 
 def _json(path: Path) -> Any:
+    """What a file says; None: there is no such file."""
     try:
         return json.loads(path.read_text())
-    except (OSError, ValueError):
+    except (FileNotFoundError, NotADirectoryError):
         return None
+    except (OSError, ValueError, RecursionError):
+        raise _Unreadable(path, "valid JSON") from None
+
+
+def _number(value: Any) -> bool:
+    """Whether it is a number that can be shown and drawn."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_number and abs(value) < 1e300  # which NaN is not
+
+
+def _is(value: Any, *kinds: type) -> Any:
+    """The value, if it is of one of the types. Raises ``TypeError`` else."""
+    if not isinstance(value, kinds):
+        raise TypeError
+    return value
+
+
+def _config(folder: Path) -> dict[str, Any]:
+    path = folder / "config.json"
+    config = _json(path)
+    if not isinstance(config, dict) or config.get("robot") not in list(ROBOTS):
+        raise _Unreadable(path, "the configuration of a run")
+    return config
+
+
+def read_result(path: Path) -> dict[str, Any] | None:
+    """What ``result.json`` says; None: the run is not finished.
+
+    Raises:
+        JaxpendError: it is not the result of a run.
+    """
+    result = _json(path)
+    if result is None and not path.exists():
+        return None
+    try:
+        parts = {k: v for k, v in _is(result, dict).items() if k not in ("robot", "seed", "score")}
+        sound = _number(result["score"])
+        for part in parts.values():
+            sound &= _number(_is(part, dict)["score"]) and _number(part.get("seconds") or 0)
+            if part.get("success"):
+                sound &= _number(_is(part["criteria"], dict)["swingup_time"])
+        if sound:
+            return result
+    except (TypeError, KeyError):
+        pass
+    raise _Unreadable(path, "the result of a run")
+
+
+def _chart(value: Any) -> tuple[str, dict[str, str], str, bool]:
+    title, curves, ylabel, log = _is(value, list)
+    curves = {label: _is(column, str) for label, column in _is(curves, dict).items()}
+    return _is(title, str), curves, _is(ylabel, str), _is(log, bool)
+
+
+def _stage(value: Any) -> StageRecord:
+    """A stage as ``run.json`` has it. Raises TypeError, KeyError or ValueError."""
+    texts = {name: _is(value[name], str) for name in ("name", "title", "unit", "column", "heading")}
+    if not _number(value["total"]):
+        raise TypeError
+    charts = tuple(_chart(chart) for chart in _is(value["charts"], list))
+    scores = tuple(_is(column, str) for column in _is(value["scores"], list))
+    return StageRecord(total=value["total"], charts=charts, scores=scores, **texts)
+
+
+def _guessed(config: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> list[StageRecord]:
+    """The stages of a run of version 0.1: sections of its configuration that have a total.
+
+    A row of its metrics has the stage, the seconds, what counts, and then what was measured.
+    """
+    totals: dict[str, Any] = {}
+    for name, section in config.items():
+        if isinstance(section, dict):
+            shown = section.get("demonstrations")
+            if isinstance(shown, dict) and shown.get("episodes", 1):
+                totals["imitation"] = shown.get("updates")
+            totals[name] = section.get("steps", section.get("generations"))
+    stages = []
+    for name, total in totals.items():
+        if not (_number(total) and total):
+            continue
+        keys = dict.fromkeys(key for row in rows if row.get("stage") == name for key in row)
+        column, *others = [key for key in keys if key not in ("stage", "seconds")] or ["step"]
+        title = name.upper() if len(name) < 5 else name.capitalize()
+        shown = [key for key in others if key not in ("rollbacks", "finite")]
+        charts = [(key.replace("_", " "), {key: key}, "", False) for key in shown]
+        scores = [key for key in others if key in ("score", "mean_score", "individual_score")]
+        heading = "" if name == "imitation" else f"after {title}"
+        words = (name, title, column.replace("_", " "), column, total, heading)
+        stages.append(StageRecord(*words, tuple(charts), tuple(scores)))
+    return stages
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    """Rows of metrics with their numbers; what a crash cut off, and what is no row, is left out."""
+    rows = []
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, ValueError):
+        return []
+    for line in lines:
+        with contextlib.suppress(ValueError, RecursionError):
+            row = json.loads(line)
+            if isinstance(row, dict) and isinstance(row.get("stage"), str):
+                rows.append({k: v for k, v in row.items() if k == "stage" or _number(v)})
+    return rows
+
+
+def _made_by(said: Any) -> dict[str, Any]:
+    """Texts (command, version), the ``plant``, and what is ``changed``: name -> value, default."""
+    plant, changed = (_is(_is(said, dict).get(k, {}), dict) for k in ("plant", "changed"))
+    if not all(map(_number, plant.values())) or any(len(pair) != 2 for pair in changed.values()):
+        raise TypeError
+    return {k: v for k, v in said.items() if isinstance(v, str) or k in ("plant", "changed")}
+
+
+def read_run(folder: Path) -> RunRecord:
+    """A run folder.
+
+    Raises:
+        JaxpendError: a file in it is not what it should be.
+    """
+    config, rows, path = _config(folder), _rows(folder / "metrics.jsonl"), folder / "run.json"
+    said = {} if (said := _json(path)) is None else said
+    try:
+        made_by, told = _made_by(said), said.get("stages")
+        stages = _guessed(config, rows) if told is None else [_stage(s) for s in _is(told, list)]
+    except (TypeError, KeyError, ValueError):
+        raise _Unreadable(path, "what a run says of itself") from None
+    order = {stage.name: (k, stage.column) for k, stage in enumerate(stages)}
+    once = {}  # a row that came twice counts once
+    for row in rows:
+        k, column = order.get(row["stage"], (0, ""))
+        if column in row:
+            once[k, row[column]] = row
+    policies = ["policy.npz", *(f"{stage.name}_best.npz" for stage in reversed(stages))]
+    return RunRecord(
+        name=folder.name,
+        robot=config["robot"],
+        config=config,
+        stages=tuple(stages),
+        rows=[once[key] for key in sorted(once)],
+        result=read_result(folder / "result.json"),
+        policy=next((str(folder / n) for n in policies if (folder / n).exists()), None),
+        made_by=made_by,
+    )
+
+
+def seed_folders(folder: Path) -> list[Path]:
+    """The runs of a group of seeds, in the order of the seeds."""
+    parts = (path.parent for path in folder.glob("seed*/config.json"))
+    return sorted(parts, key=lambda p: (len(p.name), p.name))
+
+
+def find(run: Path) -> list[RunRecord]:
+    """The runs that a path means: a run folder, a folder of seeds, a policy file, or a robot's
+    name for the policy that ships with the package.
+
+    Raises:
+        JaxpendError: it is none of these, or cannot be read.
+    """
+    from ..controllers.files import read_header  # loads jax
+
+    if seeds := seed_folders(run):
+        return [read_run(seed) for seed in seeds]
+    if (run / "config.json").exists():
+        return [read_run(run)]
+    if run.is_file() or (str(run) in ROBOTS and not run.exists()):
+        return [RunRecord(run.stem, read_header(run)["robot"], {}, (), [], None, str(run))]
+    raise JaxpendError(
+        f"{run} is not a run: give a folder that training has left (with config.json), a folder "
+        f"of seeds, a policy file, or {' or '.join(ROBOTS)} for the policy that ships"
+    )
+
+
+def remarks(runs: Sequence[RunRecord]) -> list[str]:
+    """What is not finished, or went wrong on the way, a sentence each."""
+    sentences = []
+    for run in runs:
+        if run.config and run.result is None:
+            where = ", ".join(
+                f"{stage.title} is at {done:,} of {total:,} {stage.unit}"
+                for stage, (done, total) in zip(run.stages, run.progress.values(), strict=True)
+            )
+            diverged = any(row.get("finite") == 0 for row in run.rows)
+            sentences.append(f"{run.name} is not finished{' and diverged' * diverged}: {where}.")
+        if back := max((row.get("rollbacks", 0) for row in run.rows), default=0):
+            text = f"{run.name} diverged and went back to its last good state {back} time"
+            sentences.append(f"{text}{'s' * (back > 1)}.")
+    return sentences
+
+
+# --- the list of runs ----------------------------------------------------------------------
 
 
 def _locked(folder: Path) -> bool:
     """Whether a process works on the run. Its lock is tried only while the process is there."""
-    with contextlib.suppress(OSError, ValueError), (folder / ".lock").open() as file:
+    with contextlib.suppress(OSError, ValueError, OverflowError), (folder / ".lock").open() as file:
         os.kill(int(file.read()), 0)
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -48,65 +302,46 @@ def _locked(folder: Path) -> bool:
     return False
 
 
-def _progress(folder: Path, config: Mapping) -> tuple[str, float | None]:
-    """How far the metrics go, and the seconds of their last row."""
-    for line in reversed(_lines(folder / "metrics.jsonl")):
-        with contextlib.suppress(ValueError, KeyError, TypeError):  # what a crash cut off
-            row = json.loads(line)
-            if row["stage"] == "imitation":
-                at, of = row["updates"], config["sac"]["demonstrations"]["updates"]
-                return f"imitation {at:,}/{of:,}", row.get("seconds")
-            column, total = STAGES[row["stage"]]
-            of = config[row["stage"]][total]
-            return f"{row['stage'].upper()} {row[column]:,}/{of:,}", row.get("seconds")
-    return "the start", None
+def _changed(folder: Path) -> str:
+    """When a file in it was last written, as ISO 8601."""
+    times = [folder.stat().st_mtime]
+    with contextlib.suppress(OSError):
+        for path in folder.iterdir():
+            with contextlib.suppress(OSError):  # it is gone already
+                times.append(path.lstat().st_mtime)
+    newest = max(times[1:], default=times[0])
+    return datetime.datetime.fromtimestamp(newest).astimezone().isoformat(timespec="seconds")
 
 
-def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError):
-        return []
-
-
-def _run(folder: Path, name: str) -> dict[str, Any]:
+def _entry(folder: Path) -> dict[str, Any]:
     """One run folder as plain values; ``state`` is finished, running, interrupted or broken."""
-    about = {"run": name, "robot": None, "stages": [], "seed": None, "state": "broken"}
-    about |= {"at": None, "score": None, "seconds": None}
-    config, result = _json(folder / "config.json"), _json(folder / "result.json")
-    newest = max(p.stat().st_mtime for p in folder.iterdir())
-    changed = datetime.datetime.fromtimestamp(newest).astimezone()
-    about["changed"] = changed.isoformat(timespec="seconds")
-    if not isinstance(config, dict) or "robot" not in config:
-        return about | {"at": "config.json"}
-    about |= {"robot": config["robot"], "seed": config.get("seed")}
-    about["stages"] = [
-        stage
-        for stage, (_, total) in STAGES.items()
-        if isinstance(config.get(stage), dict) and config[stage].get(total, 1)
-    ]
-    at, about["seconds"] = _progress(folder, config)
-    if isinstance(result, dict) and isinstance(result.get("score"), int | float):
-        return about | {"state": "finished", "score": result["score"]}
-    if (folder / "result.json").exists():
-        return about | {"at": "result.json"}
+    about: dict[str, Any] = {"run": folder.name, "robot": None, "stages": [], "seed": None, "state": "broken"}
+    about |= {"at": None, "score": None, "seconds": None, "changed": _changed(folder)}
+    try:
+        config = _config(folder)
+        seed = config.get("seed")
+        about |= {"robot": config["robot"], "seed": seed if isinstance(seed, int) else None}
+        run = read_run(folder)
+    except _Unreadable as error:
+        return about | {"at": error.file}
+    about["stages"] = [stage.name for stage in run.stages if stage.heading]
+    last = run.rows[-1] if run.rows else {}
+    about["seconds"] = last.get("seconds")
+    if run.result is not None:
+        return about | {"state": "finished", "score": run.result["score"]}
+    here = [stage for stage in run.stages if stage.name == last.get("stage")]
+    at = f"{here[0].title} {last[here[0].column]:,}/{here[0].total:,}" if here else "the start"
     return about | {"state": "running" if _locked(folder) else "interrupted", "at": at}
 
 
-def seed_folders(folder: Path) -> list[Path]:
-    """The runs of a group of seeds, in the order of the seeds."""
-    parts = [path.parent for path in folder.glob("seed*/config.json")]
-    return sorted(parts, key=lambda p: (len(p.name), p.name))
-
-
-def _group(folder: Path, name: str) -> dict[str, Any]:
+def _group(folder: Path) -> dict[str, Any]:
     """A group of seeds: its median score, and its runs."""
-    runs = [_run(part, part.name) for part in seed_folders(folder)]
+    runs = [_entry(part) for part in seed_folders(folder)]
     scores = [run["score"] for run in runs if run["score"] is not None]
     states = [run["state"] for run in runs]
     worst = next(s for s in ("broken", "running", "interrupted", "finished") if s in states)
     return {
-        "run": name,
+        "run": folder.name,
         "robot": runs[0]["robot"],
         "stages": runs[0]["stages"],
         "seed": [run["seed"] for run in runs],
@@ -119,6 +354,11 @@ def _group(folder: Path, name: str) -> dict[str, Any]:
     }
 
 
+def _natural(path: Path) -> list[Any]:
+    """For sorting by name, the numbers in it by their value."""
+    return [int(x) if x.isdecimal() else x for x in re.split(r"(\d+)", path.name)]
+
+
 def listing(folder: str | Path) -> list[dict[str, Any]]:
     """The runs in a folder, by name; a group of seeds is one entry, with its ``runs``.
 
@@ -128,43 +368,12 @@ def listing(folder: str | Path) -> list[dict[str, Any]]:
     folder, entries = Path(folder), []
     if not folder.is_dir():
         raise JaxpendError(f"there is no folder {folder}; jaxpend train makes runs")
-    natural = lambda p: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", p.name)]  # noqa: E731
-    for path in sorted((p for p in folder.iterdir() if p.is_dir()), key=natural):
-        if (path / "config.json").exists():
-            entries.append(_run(path, path.name))
-        elif seed_folders(path):
-            entries.append(_group(path, path.name))
+    for path in sorted((p for p in folder.iterdir() if p.is_dir()), key=_natural):
+        with contextlib.suppress(PermissionError):  # whatever it is, it is not ours
+            if (path / "config.json").exists():
+                entries.append(_entry(path))
+            elif seed_folders(path):
+                entries.append(_group(path))
     if not entries:
         raise JaxpendError(f"there are no runs in {folder}; jaxpend train makes runs")
     return entries
-
-
-def runs_table(entries: Sequence[Mapping[str, Any]]) -> None:
-    """Print runs, a row each, on standard error like all tables."""
-    from rich import box
-    from rich.table import Table
-
-    from ..terminal import console
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("run", "robot", "stages", "seed", "state", "score", "time", "changed"):
-        right = heading in ("score", "time")
-        table.add_column(heading, justify="right" if right else "left", overflow="fold")
-    colours = {"finished": "green", "running": "cyan", "interrupted": "yellow", "broken": "red"}
-    groups = False
-    for run in entries:
-        groups |= "runs" in run
-        seed = f"{len(run['seed'])} seeds" if "runs" in run else run["seed"]
-        state = f"[{colours[run['state']]}]{run['state']}[/]"
-        date = datetime.datetime.fromisoformat(run["changed"])
-        table.add_row(
-            run["run"], run["robot"] or "", ", ".join(s.upper() for s in run["stages"]),
-            "" if seed is None else str(seed),
-            f"{state}: {run['at']}" if run["at"] else state,
-            "" if run["score"] is None else f"{run['score']:.4f}",
-            "" if run["seconds"] is None else f"{run['seconds']:.0f} s",
-            f"{date:%d %b %H:%M}",
-        )  # fmt: skip
-    console.print(table)
-    if groups:
-        console.print("the score of several seeds is the median of those finished", style="dim")

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import shutil
 import time
 import weakref
 from collections.abc import Mapping
@@ -13,7 +12,7 @@ from ..errors import JaxpendError
 
 __all__ = ["Events", "require"]
 
-COLUMNS = ("env_steps", "generation", "updates")  # the first that a row has counts its steps
+SUFFIX = ".jaxpend"  # of the event files that are ours
 
 
 def require() -> None:
@@ -31,17 +30,23 @@ class Events:
     They are made anew from the metrics on disk, so that a run that goes on from a checkpoint has no
     row twice. Every row is on disk when ``add`` returns (``SummaryWriter`` would leave that to a
     thread and lose the last ones).
+
+    Args:
+        run: the run folder.
+        columns: name of a stage -> the column of its metrics that counts its steps.
     """
 
-    def __init__(self, run: Path):
+    def __init__(self, run: Path, columns: Mapping[str, str]):
         from tensorboardX.event_file_writer import EventsWriter
 
-        shutil.rmtree(run / "tensorboard", ignore_errors=True)
-        (run / "tensorboard").mkdir()
-        self._writer = EventsWriter(str(run / "tensorboard" / "events"))
+        folder, self.columns = run / "tensorboard", columns
+        folder.mkdir(exist_ok=True)
+        for path in folder.glob(f"events.out.tfevents.*{SUFFIX}"):
+            path.unlink()
+        self._writer = EventsWriter(str(folder / "events"), SUFFIX)
         weakref.finalize(self, self._writer.close)
         for line in (run / "metrics.jsonl").read_text().splitlines():
-            with contextlib.suppress(ValueError):
+            with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError):  # no row
                 self.add(json.loads(line))
 
     def add(self, row: Mapping[str, Any]) -> None:
@@ -49,7 +54,7 @@ class Events:
         from tensorboardX.proto.event_pb2 import Event
         from tensorboardX.summary import scalar
 
-        column = next(name for name in COLUMNS if name in row)
+        column = self.columns[row["stage"]]
         for name, value in row.items():
             if isinstance(value, int | float) and name not in ("seconds", column):
                 summary = scalar(f"{row['stage']}/{name}", value)

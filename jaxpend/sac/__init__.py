@@ -1,7 +1,8 @@
-"""Soft actor-critic: networks, demonstrations and the algorithm, all on device."""
+"""Soft actor-critic: networks, critics, replay, demonstrations and the algorithm, on device."""
 
 from ..config import SACConfig
 from .algorithm import (
+    Agent,
     SACState,
     begin,
     greedy_policy,
@@ -13,6 +14,7 @@ from .algorithm import (
 )
 
 __all__ = [
+    "Agent",
     "SACConfig",
     "SACState",
     "begin",

@@ -6,152 +6,170 @@ bootstraps from the true next state.
 """
 
 import dataclasses
-from functools import partial
+from functools import cached_property, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 
+from ..boards import Task
 from ..config import SACConfig
 from ..controllers.policy import Policy
-from ..env import DoublePendulum
-from ..pytree import pytree
+from ..env import Env, EnvState
+from ..pytree import Pytree, pytree
+from . import losses, replay
+from .critics import Critic, TwinCritic
 from .demonstrations import Imitation, imitate, imitation, swingups
-from .networks import Actor, TwinCritic, constant_log_std, sample_action, to_policy
+from .networks import Actor, Params, act, constant_log_std, to_policy
+from .replay import Replay, Transition
 
-__all__ = ["SACConfig", "SACState", "greedy_policy", "init", "train_chunk"]
+__all__ = [
+    "Agent",
+    "SACConfig",
+    "SACState",
+    "begin",
+    "greedy_policy",
+    "imitate_chunk",
+    "init",
+    "interact",
+    "sample",
+    "structure",
+    "train_chunk",
+    "train_chunks",
+    "update",
+]
+
+Metrics = dict[str, jax.Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class Agent:
+    """What learns, and where: all that stays the same in training; hashable, so static in jit."""
+
+    config: SACConfig
+    task: Task
+
+    @cached_property
+    def env(self) -> Env:
+        """The environment."""
+        return Env(self.config.env, self.task)
+
+    @cached_property
+    def actor(self) -> Actor:
+        """The network that acts."""
+        return Actor(self.config.actor_hidden, self.config.activation)
+
+    @cached_property
+    def critic(self) -> Critic:
+        """What judges actions."""
+        config = self.config
+        return TwinCritic(config.critic_hidden, config.activation, config.critic_layer_norm)
+
+    @cached_property
+    def optimizer(self) -> optax.GradientTransformation:
+        """Adam with cosine decay over the whole run."""
+        config = self.config
+        total = config.steps // config.num_envs * config.updates_per_step
+        schedule = optax.cosine_decay_schedule(
+            config.learning_rate, max(total, 1), alpha=config.final_learning_rate
+        )
+        return optax.adam(schedule)
 
 
 @pytree
-class Replay:
-    """Ring buffer of transitions: observation, action, scaled reward, next observation."""
-
-    rows: jax.Array  # (capacity, 2 observation_size + 2)
-    position: jax.Array  # () int, next row to write
-    size: jax.Array  # () int, rows filled
-
-
-@pytree
-class Demonstrations:
-    """Rows of demonstrations; as many as there could be, so that all seeds compile the same."""
-
-    rows: jax.Array  # (capacity, 2 observation_size + 3) as in Replay, and wanted actions
-    size: jax.Array  # () int, rows filled
-
-
-@pytree
-class SACState:
+class SACState(Pytree):
     """Everything that training changes."""
 
-    actor: dict
-    critic: dict
-    target: dict
-    log_temperature: jax.Array
+    actor: Params
+    critic: Params
+    target: Params  # of the critic, following slowly
+    log_temperature: jax.Array  # ()
     actor_opt: optax.OptState
     critic_opt: optax.OptState
     temperature_opt: optax.OptState
     replay: Replay
-    demonstrations: Demonstrations | None
-    env_x: dict  # brax State, batched over environments
+    demonstrations: Replay | None  # of one shape, so that all seeds compile the same
+    envs: EnvState  # (num_envs, ...)
     env_time: jax.Array  # (num_envs,) int, steps into the episode
     key: jax.Array
     env_steps: jax.Array  # () int
     updates: jax.Array  # () int
 
 
-def networks(config: SACConfig) -> tuple[Actor, TwinCritic]:
-    """The actor and the critics of a configuration."""
-    seen = DoublePendulum(config.env).seen_size
-    actor = Actor(config.actor_hidden, config.activation, seen)
-    return actor, TwinCritic(config.critic_hidden, config.activation, config.critic_layer_norm)
-
-
-def optimizer(config: SACConfig) -> optax.GradientTransformation:
-    """Adam with cosine decay over the whole run."""
-    total = config.steps // config.num_envs * config.updates_per_step
-    schedule = optax.cosine_decay_schedule(
-        config.learning_rate, max(total, 1), alpha=config.final_learning_rate
-    )
-    return optax.adam(schedule)
-
-
-def init(config: SACConfig, key: jax.Array) -> SACState:
+def init(agent: Agent, key: jax.Array) -> SACState:
     """Fresh networks, an empty replay buffer and environments at random times of an episode.
 
     With ``config.demonstrations`` the actor starts from imitation of the optimised swing-up, and
     half of every batch is drawn from its demonstrations (Ball et al., "Efficient online
     reinforcement learning with offline data", 2023). ``key`` is consumed.
     """
-    state, learner = begin(config, key)
+    state, learner = begin(agent, key)
     if learner is None:
         return state
-    learner, _ = imitate_chunk(config, state, learner, config.demonstrations.updates)
+    learner, _ = imitate_chunk(agent, state, learner, agent.config.demonstrations.updates)
     return state.replace(actor=learner.params)
 
 
-def begin(config: SACConfig, key: jax.Array) -> tuple[SACState, Imitation | None]:
+def begin(agent: Agent, key: jax.Array) -> tuple[SACState, Imitation | None]:
     """``init`` before imitation, and the imitation that is to be done with ``imitate_chunk``."""
     key, key_demonstrate, key_imitate = jax.random.split(key, 3)
-    state, recipe = _fresh(config, key), config.demonstrations
-    if not recipe.episodes:
+    state, config = _fresh(agent, key), agent.config
+    if state.demonstrations is None:
         return state, None
-    env = DoublePendulum(config.env)
-    rows, wanted = swingups(recipe, env, key_demonstrate, reward_scale=config.reward_scale)
-    size = jnp.asarray(len(rows), jnp.int32)
-    missing = recipe.episodes * round(recipe.duration / config.env.dt) - len(rows)
-    rows = jnp.pad(jnp.concatenate([rows, wanted[:, None]], axis=1), ((0, missing), (0, 0)))
+    recipe = config.demonstrations
+    shown = swingups(recipe, agent.env, key_demonstrate, reward_scale=config.reward_scale)
     params = constant_log_std(state.actor, recipe.log_std)
-    state = state.replace(demonstrations=Demonstrations(rows, size))
+    state = state.replace(demonstrations=replay.fill(state.demonstrations, shown))
     return state, imitation(recipe, params, key_imitate)
 
 
-@partial(jax.jit, static_argnames=("config", "updates"))
-def imitate_chunk(config: SACConfig, state: SACState, learner: Imitation, updates: int):
+@partial(jax.jit, static_argnames=("agent", "updates"))
+def imitate_chunk(
+    agent: Agent, state: SACState, learner: Imitation, updates: int
+) -> tuple[Imitation, jax.Array]:
     """``updates`` steps of imitating the demonstrations; returns the learner and its mean loss."""
-    recipe, shown = config.demonstrations, state.demonstrations
-    actor, size = networks(config)[0], DoublePendulum(config.env).observation_size
-    obs, wanted = shown.rows[:, :size], shown.rows[:, -1]
-    learner, losses = imitate(recipe, actor, learner, obs, wanted, updates, shown.size)
-    return learner, losses.mean()
+    recipe, shown = agent.config.demonstrations, state.demonstrations
+    learner, errors = imitate(recipe, agent.actor, learner, shown, updates)
+    return learner, errors.mean()
 
 
-def structure(config: SACConfig) -> tuple[SACState, Imitation | None]:
-    """What ``begin`` returns, as a structure without numbers, and without the right shapes."""
+def structure(agent: Agent) -> tuple[SACState, Imitation | None]:
+    """What ``begin`` returns, as shapes and types without numbers."""
 
     def shown(key):
-        state, recipe = _fresh(config, key), config.demonstrations
-        if not recipe.episodes:
-            return state, None
-        return state.replace(
-            demonstrations=Demonstrations(jnp.zeros(()), jnp.zeros(()))
-        ), imitation(recipe, state.actor, key)
+        state, recipe = _fresh(agent, key), agent.config.demonstrations
+        return state, imitation(recipe, state.actor, key) if recipe.episodes else None
 
     return jax.eval_shape(shown, jax.random.key(0))
 
 
-@partial(jax.jit, static_argnames="config")
-def _fresh(config: SACConfig, key: jax.Array) -> SACState:
-    env = DoublePendulum(config.env)
-    actor, critic = networks(config)
+@partial(jax.jit, static_argnames="agent")
+def _fresh(agent: Agent, key: jax.Array) -> SACState:
+    config, env, opt = agent.config, agent.env, agent.optimizer
     key, key_actor, key_critic, key_env, key_time = jax.random.split(key, 5)
-    obs, action = jnp.zeros(env.observation_size), jnp.zeros(1)
-    actor_params = actor.init(key_actor, obs)
-    critic_params = critic.init(key_critic, obs, action)
-    log_temperature = jnp.log(jnp.asarray(config.init_temperature))
-    opt = optimizer(config)
-    capacity = config.replay_capacity // config.num_envs * config.num_envs
+    envs = jax.vmap(env.reset)(jax.random.split(key_env, config.num_envs))
+    one = jax.tree.map(lambda leaf: leaf[0], envs)
     zero = jnp.zeros((), jnp.int32)
+    actor = agent.actor.init(key_actor, one.obs)
+    critic = agent.critic.init(key_critic, one.obs, one.privileged, one.action)
+    log_temperature = jnp.log(jnp.asarray(config.init_temperature))
+    like, recipe = Transition.between(one, one.action, one, 1.0), config.demonstrations
+    demonstrations = None
+    if recipe.episodes:
+        times = recipe.episodes * round(recipe.duration / config.env.dt)
+        demonstrations = replay.init(like.replace(wanted=one.action), times, 1)
     return SACState(
-        actor=actor_params,
-        critic=critic_params,
-        target=jax.tree.map(jnp.copy, critic_params),
+        actor=actor,
+        critic=critic,
+        target=jax.tree.map(jnp.copy, critic),
         log_temperature=log_temperature,
-        actor_opt=opt.init(actor_params),
-        critic_opt=opt.init(critic_params),
+        actor_opt=opt.init(actor),
+        critic_opt=opt.init(critic),
         temperature_opt=opt.init(log_temperature),
-        demonstrations=None,
-        replay=Replay(jnp.zeros((capacity, 2 * env.observation_size + 2)), zero, zero),
-        env_x=jax.vmap(env.reset)(jax.random.split(key_env, config.num_envs)),
+        replay=replay.init(like, config.replay_capacity // config.num_envs, config.num_envs),
+        demonstrations=demonstrations,
+        envs=envs,
         # Spread out, so that the environments are not all in the same phase of an episode.
         env_time=jax.random.randint(key_time, (config.num_envs,), 0, config.env.episode_steps),
         key=key,
@@ -160,61 +178,46 @@ def _fresh(config: SACConfig, key: jax.Array) -> SACState:
     )
 
 
-def soft_value(actor_params, critic_params, config: SACConfig, log_temperature, obs, key):
-    """``min_i Q_i(s, a) - T log pi(a|s)`` with a drawn from the policy; returns it and log pi."""
-    actor, critic = networks(config)
-    action, log_prob = sample_action(*actor.apply(actor_params, obs), key)
-    q = critic.apply(critic_params, obs, action).min(axis=-1)
-    return q - jnp.exp(log_temperature) * log_prob, log_prob
+def update(
+    agent: Agent, state: SACState, batch: Transition, key: jax.Array
+) -> tuple[SACState, Metrics]:
+    """One gradient step on critic, actor and temperature from a batch (n, ...) of ``sample``.
 
-
-def update(config: SACConfig, state: SACState, batch: jax.Array, key: jax.Array):
-    """One gradient step on critics, actor and temperature from a batch of ``sample``.
-
-    The critics minimise the squared distance to ``r + gamma V(s')``, V being the soft value under
-    the target critics. The actor maximises the soft value under the critics, less the weighted
-    distance to demonstrated actions.
+    The actor maximises the soft value under the critic, less the weighted distance to demonstrated
+    actions, which are the first half of the batch. ``key`` is consumed.
     """
-    opt, (actor, critic_net) = optimizer(config), networks(config)
+    config, actor, critic, opt = agent.config, agent.actor, agent.critic, agent.optimizer
     key_critic, key_actor = jax.random.split(key)
-    n = DoublePendulum(config.env).observation_size
-    columns = (n, n + 1, n + 2, 2 * n + 2)
-    obs, action, reward, next_obs, wanted = jnp.split(batch, columns, axis=1)
-    next_value, _ = soft_value(
-        state.actor, state.target, config, state.log_temperature, next_obs, key_critic
+    temperature = jnp.exp(state.log_temperature)
+
+    next_action, log_prob = act(actor, state.actor, batch.next_obs, key_critic)
+    (loss_q, value), grads = jax.value_and_grad(critic.loss, has_aux=True)(
+        state.critic, state.target, batch, next_action, temperature * log_prob, config.discount
     )
-    target = reward[:, 0] + config.discount * next_value
-
-    def critic_loss(params):
-        q = critic_net.apply(params, obs, action)
-        return jnp.mean((q - target[:, None]) ** 2), q.mean()
-
-    (loss_q, value), grads = jax.value_and_grad(critic_loss, has_aux=True)(state.critic)
     updates, critic_opt = opt.update(grads, state.critic_opt)
-    critic = optax.apply_updates(state.critic, updates)
+    critic_params = optax.apply_updates(state.critic, updates)
 
     def actor_loss(params):
-        value, log_prob = soft_value(params, critic, config, state.log_temperature, obs, key_actor)
-        loss = -value.mean()
-        if wanted.size:
+        action, log_prob = act(actor, params, batch.obs, key_actor)
+        value = critic.value(critic_params, batch.obs, batch.privileged, action)
+        loss = losses.actor(value, temperature * log_prob)
+        if batch.wanted is not None:
             shown = config.batch_size // 2
-            greedy = jnp.tanh(actor.apply(params, obs[:shown])[0])
-            loss += config.imitation * jnp.mean((greedy - wanted[:shown]) ** 2)
+            mean, _ = actor.apply(params, batch.obs[:shown])
+            loss += config.imitation * losses.imitation(mean[:, 0], batch.wanted[:shown])
         return loss, -log_prob.mean()
 
     (loss_pi, entropy), grads = jax.value_and_grad(actor_loss, has_aux=True)(state.actor)
     updates, actor_opt = opt.update(grads, state.actor_opt)
     learns = state.env_steps >= config.actor_delay
     updates = jax.tree.map(lambda u: jnp.where(learns, u, 0.0), updates)
-    # d/d log(temperature) of temperature (entropy - target)
-    slope = jnp.exp(state.log_temperature) * (entropy - config.target_entropy)
+    slope = losses.temperature_slope(state.log_temperature, entropy, config.target_entropy)
     step, temperature_opt = opt.update(slope, state.temperature_opt)
-    step = jnp.where(learns, step, 0.0)
     state = state.replace(
         actor=optax.apply_updates(state.actor, updates),
-        critic=critic,
-        target=optax.incremental_update(critic, state.target, config.target_rate),
-        log_temperature=state.log_temperature + step,
+        critic=critic_params,
+        target=optax.incremental_update(critic_params, state.target, config.target_rate),
+        log_temperature=state.log_temperature + jnp.where(learns, step, 0.0),
         actor_opt=actor_opt,
         critic_opt=critic_opt,
         temperature_opt=temperature_opt,
@@ -224,84 +227,68 @@ def update(config: SACConfig, state: SACState, batch: jax.Array, key: jax.Array)
     return state, metrics
 
 
-def interact(config: SACConfig, state: SACState, key: jax.Array):
-    """One step of every environment into the replay buffer; returns the mean reward too."""
-    env = DoublePendulum(config.env)
-    actor, _ = networks(config)
+def interact(agent: Agent, state: SACState, key: jax.Array) -> tuple[SACState, jax.Array]:
+    """One step of every environment into the replay buffer; returns the mean reward too.
+
+    ``key`` is consumed.
+    """
+    config, env, before = agent.config, agent.env, state.envs
     key_action, key_uniform, key_reset = jax.random.split(key, 3)
-    before = state.env_x
-    action, _ = sample_action(*actor.apply(state.actor, before.obs), key_action)
+    action, _ = act(agent.actor, state.actor, before.obs, key_action)
     uniform = jax.random.uniform(key_uniform, action.shape, minval=-1.0, maxval=1.0)
     action = jnp.where(state.env_steps < config.warmup_steps, uniform, action)
     after = jax.vmap(env.step)(before, action)
-    reward = config.reward_scale * after.reward[:, None]
-    rows = jnp.concatenate([before.obs, action, reward, after.obs], axis=1)
-    replay, capacity = state.replay, state.replay.rows.shape[0]
-    replay = Replay(
-        rows=jax.lax.dynamic_update_slice(replay.rows, rows, (replay.position, 0)),
-        position=(replay.position + config.num_envs) % capacity,
-        size=jnp.minimum(replay.size + config.num_envs, capacity),
-    )
-    speed = jnp.abs(after.pipeline_state["x"][:, 2:]).max(axis=1)
+    now = Transition.between(before, action, after, config.reward_scale)
     truncated = state.env_time + 1 >= config.env.episode_steps
-    truncated |= speed > config.env.max_speed
+    truncated |= jnp.abs(after.x[:, 2:]).max(axis=1) > config.env.max_speed
     fresh = jax.vmap(env.reset)(jax.random.split(key_reset, config.num_envs))
 
     def restart(new, old):
         return jnp.where(truncated.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
 
     state = state.replace(
-        replay=replay,
-        env_x=jax.tree.map(restart, fresh, after),
+        replay=replay.add(state.replay, now),
+        envs=jax.tree.map(restart, fresh, after),
         env_time=jnp.where(truncated, 0, state.env_time + 1),
         env_steps=state.env_steps + config.num_envs,
     )
     return state, after.reward.mean()
 
 
-def sample(config: SACConfig, state: SACState, key: jax.Array) -> jax.Array:
-    """Batches of replay rows for one vector step, (updates_per_step, batch_size, columns).
+def sample(agent: Agent, state: SACState, key: jax.Array) -> Transition:
+    """Batches for one step of all environments, (updates_per_step, batch_size, ...).
 
-    With demonstrations they come first, and there is a last column of wanted actions, which are 0
-    in the other half. With ``config.mirror`` every other row is mirrored, by chance.
+    With demonstrations they are the first half, and the other half wants the action 0. With
+    ``config.mirror`` every other transition is mirrored, by chance. ``key`` is consumed.
     """
+    config = agent.config
     if config.mirror:
         key, key_mirror = jax.random.split(key)
-        rows = _sample(config, state, key)
-        signs = DoublePendulum(config.env).mirrored
-        signs = jnp.array([*signs, -1, 1, *signs, -1][: rows.shape[-1]], rows.dtype)
-        flip = jax.random.bernoulli(key_mirror, shape=(*rows.shape[:-1], 1))
-        return rows * jnp.where(flip, signs, 1)
-    return _sample(config, state, key)
-
-
-def _sample(config: SACConfig, state: SACState, key: jax.Array) -> jax.Array:
-    """``sample`` without a mirror."""
-
-    def draw(rows, size, key, count):
-        return rows[jax.random.randint(key, (config.updates_per_step, count), 0, size)]
-
     if state.demonstrations is None:
-        return draw(state.replay.rows, state.replay.size, key, config.batch_size)
-    key_own, key_demo = jax.random.split(key)
-    half = config.batch_size // 2
-    own = draw(state.replay.rows, state.replay.size, key_own, config.batch_size - half)
-    demo = draw(state.demonstrations.rows, state.demonstrations.size, key_demo, half)
-    return jnp.concatenate([demo, jnp.pad(own, ((0, 0), (0, 0), (0, 1)))], axis=1)
+        batch = replay.sample(state.replay, key, (config.updates_per_step, config.batch_size))
+    else:
+        key_own, key_demo = jax.random.split(key)
+        half, rest = config.batch_size // 2, config.batch_size - config.batch_size // 2
+        own = replay.sample(state.replay, key_own, (config.updates_per_step, rest))
+        demo = replay.sample(state.demonstrations, key_demo, (config.updates_per_step, half))
+        own = own.replace(wanted=jnp.zeros_like(own.action))
+        batch = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), demo, own)
+    return replay.mirrored(agent.env, batch, key_mirror) if config.mirror else batch
 
 
-@partial(jax.jit, static_argnames=("config", "vector_steps"))
-def train_chunk(config: SACConfig, state: SACState, vector_steps: int):
+@partial(jax.jit, static_argnames=("agent", "vector_steps"))
+def train_chunk(agent: Agent, state: SACState, vector_steps: int) -> tuple[SACState, Metrics]:
     """``vector_steps`` steps of all environments, with their updates; returns mean metrics.
 
     ``state`` is not donated: where the new one is not finite, training goes back to the old.
     """
+    config = agent.config
 
     def learn(state, key):
         key_batch, key_update = jax.random.split(key)
         keys = jax.random.split(key_update, config.updates_per_step)
-        batches = sample(config, state, key_batch)
-        return jax.lax.scan(lambda s, i: update(config, s, *i), state, (batches, keys))
+        batches = sample(agent, state, key_batch)
+        return jax.lax.scan(lambda s, i: update(agent, s, *i), state, (batches, keys))
 
     def idle(state, key):
         shapes = jax.eval_shape(learn, state, key)[1]
@@ -309,7 +296,7 @@ def train_chunk(config: SACConfig, state: SACState, vector_steps: int):
 
     def step(state, _):
         key, key_env, key_learn = jax.random.split(state.key, 3)
-        state, reward = interact(config, state.replace(key=key), key_env)
+        state, reward = interact(agent, state.replace(key=key), key_env)
         state, metrics = jax.lax.cond(
             state.env_steps > config.warmup_steps, learn, idle, state, key_learn
         )
@@ -320,15 +307,19 @@ def train_chunk(config: SACConfig, state: SACState, vector_steps: int):
     return state, metrics | {"temperature": jnp.exp(state.log_temperature)}
 
 
-@partial(jax.jit, static_argnames=("config", "vector_steps"))
-def train_chunks(config: SACConfig, states: list[SACState], vector_steps: int):
-    """``train_chunk`` of several runs at the same step, in one vmap: [(state, metrics), ...].
+@partial(jax.jit, static_argnames=("agent", "vector_steps"))
+def train_chunks(
+    agent: Agent, states: list[SACState], vector_steps: int
+) -> list[tuple[SACState, Metrics]]:
+    """``train_chunk`` of several runs at the same step, in one vmap.
 
     What counts steps is the same in all runs and not batched: a batched condition would become a
     select that copies the replay buffers at every step.
     """
-    axes = SACState(**{f.name: 0 for f in dataclasses.fields(SACState)}).replace(
-        replay=Replay(0, None, None), env_steps=None, updates=None
+    first: Any = 0  # the batched axis; None where nothing is batched
+    none: Any = None
+    axes = SACState(**dict.fromkeys(SACState.__dataclass_fields__, first)).replace(
+        replay=Replay(first, none, none), env_steps=none, updates=none
     )
 
     def per_axis(batched, shared, *trees):
@@ -338,7 +329,7 @@ def train_chunks(config: SACConfig, states: list[SACState], vector_steps: int):
         return jax.tree.map(part, axes, *trees, is_leaf=lambda axis: axis is None)
 
     stacked = per_axis(lambda *leaves: jnp.stack(leaves), lambda first, *_: first, *states)
-    chunk = jax.vmap(partial(train_chunk, config, vector_steps=vector_steps), (axes,), (axes, 0))
+    chunk = jax.vmap(partial(train_chunk, agent, vector_steps=vector_steps), (axes,), (axes, 0))
     after, metrics = chunk(stacked)
     return [
         (
@@ -349,6 +340,6 @@ def train_chunks(config: SACConfig, states: list[SACState], vector_steps: int):
     ]
 
 
-def greedy_policy(config: SACConfig, state: SACState) -> Policy:
+def greedy_policy(agent: Agent, state: SACState) -> Policy:
     """The deterministic policy as a ``Controller``."""
-    return to_policy(state.actor, networks(config)[0], config.env)
+    return to_policy(state.actor, agent.actor, agent.env)

@@ -1,17 +1,20 @@
-"""Flax networks of SAC: a tanh-Gaussian actor and twin critics."""
+"""Flax networks of SAC: a tanh-Gaussian actor, action values, and the policy made of an actor."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from ..controllers.policy import ACTIVATIONS, Policy
-from ..env import EnvConfig
+from ..env import Env
 
-__all__ = ["Actor", "TwinCritic", "constant_log_std", "sample_action", "to_policy"]
+__all__ = ["Actor", "Params", "Twins", "act", "constant_log_std", "sample_action", "to_policy"]
 
 LOG_STD_RANGE = (-10.0, 2.0)
+
+Params = Mapping[str, Any]  # of a Flax network: {"params": {layer: ...}}
 
 
 class Trunk(nn.Module):
@@ -23,6 +26,7 @@ class Trunk(nn.Module):
 
     @nn.compact
     def __call__(self, h: jax.Array) -> jax.Array:
+        """Features (..., hidden[-1]) of inputs (..., n)."""
         for width in self.hidden:
             h = nn.Dense(width)(h)
             h = nn.LayerNorm()(h) if self.layer_norm else h
@@ -31,35 +35,36 @@ class Trunk(nn.Module):
 
 
 class Actor(nn.Module):
-    """Mean and log standard deviation of the action before the tanh.
+    """Mean and log standard deviation (..., 1) of the action before the tanh.
 
-    It sees the first ``seen`` entries of the observation, not what is for the critics alone, such
-    as the previous action: the reward depends on it, but a policy that feeds its last action back
-    acts differently at 500 Hz than at the 100 Hz it was trained at.
+    It sees ``EnvState.obs``, not what is for the critics alone, such as the previous action: the
+    reward depends on it, but a policy that feeds its last action back acts differently at 500 Hz
+    than at the 100 Hz it was trained at.
     """
 
     hidden: Sequence[int]
     activation: str
-    seen: int
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
-        h = Trunk(self.hidden, self.activation)(obs[..., : self.seen])
+        """For observations (..., obs_size)."""
+        h = Trunk(self.hidden, self.activation)(obs)
         mean = nn.Dense(1, name="mean")(h)
         log_std = nn.Dense(1, name="log_std")(h)
         return mean, jnp.clip(log_std, *LOG_STD_RANGE)
 
 
-class TwinCritic(nn.Module):
-    """Two independent action values, shape (..., 2)."""
+class Twins(nn.Module):
+    """Two independent action values."""
 
     hidden: Sequence[int]
     activation: str
     layer_norm: bool
 
     @nn.compact
-    def __call__(self, obs: jax.Array, action: jax.Array) -> jax.Array:
-        inputs = jnp.concatenate([obs, action], axis=-1)
+    def __call__(self, obs: jax.Array, privileged: jax.Array, action: jax.Array) -> jax.Array:
+        """Action values (..., 2) of what is seen and actions (...,)."""
+        inputs = jnp.concatenate([obs, privileged, action[..., None]], axis=-1)
         values = []
         for _ in range(2):
             h = Trunk(self.hidden, self.activation, self.layer_norm)(inputs)
@@ -67,21 +72,31 @@ class TwinCritic(nn.Module):
         return jnp.concatenate(values, axis=-1)
 
 
-def sample_action(mean, log_std, key) -> tuple[jax.Array, jax.Array]:
-    """Sample tanh(N(mean, std)); returns action (..., 1) and log-probability (...,).
+def sample_action(
+    mean: jax.Array, log_std: jax.Array, key: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Sample tanh(N(mean, std)) for a mean and a logarithm of std (..., 1), as of ``Actor``.
 
-    The log-probability is computed from the sample before the tanh, with
-    ``log(1 - tanh(v)^2) = 2 (log 2 - v - softplus(-2 v))`` (Haarnoja et al., 2018, appendix C).
-    ``key`` is consumed.
+    Returns the action (...,) and its log-probability (...,), computed from the sample before the
+    tanh with ``log(1 - tanh(v)^2) = 2 (log 2 - v - softplus(-2 v))`` (Haarnoja et al., 2018,
+    appendix C). ``key`` is consumed.
     """
     noise = jax.random.normal(key, mean.shape, mean.dtype)
     v = mean + jnp.exp(log_std) * noise
     log_prob = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
     log_prob = log_prob - 2 * (jnp.log(2.0) - v - jax.nn.softplus(-2 * v))
-    return jnp.tanh(v), jnp.sum(log_prob, axis=-1)
+    return jnp.tanh(v)[..., 0], log_prob[..., 0]
 
 
-def constant_log_std(actor_params: dict, log_std: float) -> dict:
+def act(
+    actor: Actor, params: Params, obs: jax.Array, key: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """``sample_action`` for observations (..., obs_size)."""
+    mean, log_std = cast(tuple[jax.Array, jax.Array], actor.apply(params, obs))
+    return sample_action(mean, log_std, key)
+
+
+def constant_log_std(actor_params: Params, log_std: float) -> Params:
     """Actor parameters with the same log standard deviation in every state."""
     params = dict(actor_params["params"])
     head = jax.tree.map(jnp.zeros_like, params["log_std"])
@@ -89,16 +104,16 @@ def constant_log_std(actor_params: dict, log_std: float) -> dict:
     return {"params": params}
 
 
-def to_policy(actor_params: dict, actor: Actor, env: EnvConfig) -> Policy:
+def to_policy(actor_params: Params, actor: Actor, env: Env) -> Policy:
     """The greedy policy of an actor as a ``Controller`` of plain arrays."""
-    params = actor_params["params"]
+    params, config = actor_params["params"], env.config
     trunk = params["Trunk_0"]
     dense = [trunk[f"Dense_{i}"] for i in range(len(actor.hidden))] + [params["mean"]]
     return Policy(
         layers=tuple((d["kernel"], d["bias"]) for d in dense),
-        torque_limit=jnp.asarray(env.torque_limit, jnp.float32),
-        robot=env.robot,
-        observation=env.observation,
+        torque_limit=jnp.asarray(config.torque_limit, jnp.float32),
+        robot=env.task.robot,
+        observation=config.observation,
         activation=actor.activation,
-        control_dt=env.dt,
+        control_dt=config.dt,
     )

@@ -36,7 +36,8 @@ def _ask(signum, _frame) -> None:
 def deferred() -> Iterator[None]:
     """Inside, SIGINT and SIGTERM only ask; ``stop_if_asked`` answers. A second one kills.
 
-    Outside the main thread, and for a signal that is ignored (a background job), nothing changes.
+    One that no loop has answered is answered at the end: it raises ``Stopped`` there. Outside the
+    main thread, and for a signal that is ignored (a background job), nothing changes.
     """
     before = {}
     for signum in (signal.SIGINT, signal.SIGTERM):
@@ -45,14 +46,20 @@ def deferred() -> Iterator[None]:
                 before[signum] = signal.signal(signum, _ask)
     try:
         yield
+    except BaseException:
+        if before:
+            _asked.clear()
+        raise
     finally:
         for signum, handler in before.items():
             signal.signal(signum, handler)
-        if before:
-            _asked.clear()
+    if before:
+        stop_if_asked()
 
 
 def stop_if_asked() -> None:
     """Raise ``Stopped`` if a signal came since ``deferred`` began."""
     if _asked:
-        raise Stopped(_asked[0])
+        signum = _asked[0]
+        _asked.clear()
+        raise Stopped(signum)

@@ -1,0 +1,105 @@
+"""What a run's policy does: its official run, its score and its robustness, judged once."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..boards import HEADINGS, Board
+from ..controllers.files import load_controller, read_header
+from ..plant import forward_kinematics
+from ..robustness import KEYS, benchmark
+from ..runs.reader import RunRecord
+from ..score import nominal_run
+
+__all__ = ["Judged", "criteria_costs", "judge"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Judged:
+    """A policy on the task of a board, in float64, and in the robustness benchmark."""
+
+    score: float
+    criteria: dict[str, float]
+    success: bool
+    t: Any  # (n,) s; up to where the run diverged, if it did
+    x: Any  # (n, 4) rad, rad/s
+    u: Any  # (n - 1, 2) N m
+    points: Any  # (n, 2, 2) m, elbow and end effector, x and y
+    header: dict  # of the policy file
+    report: dict | None  # of the benchmark, as it is written to a file
+
+    @property
+    def up(self) -> float | None:
+        """Swing-up time, s; None without success."""
+        return self.criteria["swingup_time"] if self.success else None
+
+    @property
+    def robustness(self) -> float | None:
+        """Overall robustness, the median over keys; None where it was not measured."""
+        return self.report["overall"] if self.report else None
+
+    @property
+    def whole(self) -> float:
+        """Length of the time axis that shows all of the run, whole seconds."""
+        return max(1.0, float(round(self.t[-1])))
+
+    @property
+    def window(self) -> float:
+        """How much of the run shows its swing-up, whole seconds."""
+        if self.up is None:
+            return self.whole
+        return min(self.whole, max(3.0, float(round(2.5 * self.up))))
+
+
+def judge(run: RunRecord, board: Board, keys: int = KEYS) -> Judged | None:
+    """The official run of a run's best policy so far, its score, and its robustness.
+
+    The policies of several seeds share one compilation.
+
+    Args:
+        run: its policy is judged; the result is None where there is none yet.
+        board: whose task it is judged on.
+        keys: of the robustness benchmark; 0 leaves it out.
+    """
+    if run.policy is None:
+        return None
+    task = board.task
+    with jax.enable_x64(True):
+        trajectory, c = nominal_run(load_controller(run.policy, robot=run.robot), task)
+        score = float(task.score(c))
+        points = jax.vmap(forward_kinematics, (None, 0))(task.plant, trajectory.x)
+    report = None
+    if keys:
+        policy = load_controller(run.policy, robot=run.robot)
+        found = benchmark(policy, board, jax.random.key(0), keys=keys)
+        report = {"robot": run.robot} | found.as_dict()
+    x = np.asarray(trajectory.x)
+    samples = np.isfinite(x).all(axis=1).cumprod().sum()  # the first one is the start
+    return Judged(
+        score=score,
+        criteria={name: float(value) for name, value in vars(c).items() if name != "success"},
+        success=bool(c.success),
+        t=np.asarray(trajectory.t)[:samples],
+        x=x[:samples],
+        u=np.asarray(trajectory.u)[: samples - 1],
+        points=np.asarray(points)[:samples],
+        header=read_header(run.policy),
+        report=report,
+    )
+
+
+def criteria_costs(judged: Judged, board: Board) -> list[dict[str, Any]]:
+    """The criteria of a board's score, and what each costs of it; none for another score."""
+    norms = dict(getattr(board.task.scoring, "norms", ()))
+    rows = []
+    for name, norm in norms.items():
+        title, unit, form = HEADINGS[name]
+        value = judged.criteria[name]
+        share = math.tanh(math.pi * value / norm)
+        share = share if math.isfinite(share) else 1.0
+        text = f"{value:{form}}"
+        rows.append({"title": title, "value": text, "unit": unit, "cost": share / len(norms)})
+    return rows

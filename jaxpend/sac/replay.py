@@ -1,0 +1,89 @@
+"""Replay: a ring buffer of typed transitions, laid out (time, environment, ...)."""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from ..env import Env, EnvState
+from ..pytree import Pytree, pytree
+
+__all__ = ["Replay", "Transition", "add", "fill", "init", "mirrored", "sample"]
+
+
+@pytree
+class Transition(Pytree):
+    """One step of one environment; all fields have the same leading axes."""
+
+    obs: jax.Array  # (..., obs_size), what the policy saw
+    privileged: jax.Array  # (..., privileged_size), what the critics saw besides
+    action: jax.Array  # (...,) in [-1, 1]
+    reward: jax.Array  # (...,) scaled
+    next_obs: jax.Array  # (..., obs_size), the true next ones, also where an episode was cut
+    next_privileged: jax.Array  # (..., privileged_size)
+    wanted: jax.Array | None = None  # (...,) the action that a demonstration asks for
+
+    @classmethod
+    def between(cls, before: EnvState, action: jax.Array, after: EnvState, reward_scale: float):
+        """What led from one state to another."""
+        reward = reward_scale * after.reward
+        return cls(before.obs, before.privileged, action, reward, after.obs, after.privileged)
+
+
+@pytree
+class Replay(Pytree):
+    """The last transitions of some environments, or the demonstrations, as of one environment."""
+
+    data: Transition  # (time, environment, ...)
+    position: jax.Array  # () int, the time that is written next
+    filled: jax.Array  # () int, times that hold something
+
+
+def init(like: Transition, times: int, environments: int) -> Replay:
+    """An empty buffer for transitions of the shapes and types of ``like``, one environment's."""
+    shape, zero = (times, environments), jnp.zeros((), jnp.int32)
+    return Replay(jax.tree.map(lambda v: jnp.zeros(shape + v.shape, v.dtype), like), zero, zero)
+
+
+def add(replay: Replay, now: Transition) -> Replay:
+    """Write a step of all environments, (environment, ...), over the oldest one."""
+    times, environments = replay.data.action.shape
+    chex.assert_shape((now.action, now.reward), (environments,))
+
+    def write(old, new):
+        return jax.lax.dynamic_update_index_in_dim(old, new, replay.position, axis=0)
+
+    data = jax.tree.map(write, replay.data, now)
+    return Replay(data, (replay.position + 1) % times, jnp.minimum(replay.filled + 1, times))
+
+
+def fill(replay: Replay, shown: Transition) -> Replay:
+    """An empty buffer of one environment, with transitions (n, ...), as many as fit or fewer."""
+
+    def padded(empty, rows):
+        return jnp.pad(rows[:, None], [(0, len(empty) - len(rows))] + [(0, 0)] * rows.ndim)
+
+    filled = jnp.asarray(len(shown.action), jnp.int32)
+    return replay.replace(data=jax.tree.map(padded, replay.data, shown), filled=filled)
+
+
+def sample(replay: Replay, key: jax.Array, shape: tuple[int, ...]) -> Transition:
+    """Transitions (*shape, ...), each any of the filled ones; ``key`` is consumed."""
+    environments = replay.data.action.shape[1]
+    flat = jax.random.randint(key, shape, 0, replay.filled * environments)
+    time, environment = flat // environments, flat % environments
+    return jax.tree.map(lambda v: v[time, environment], replay.data)
+
+
+def mirrored(env: Env, batch: Transition, key: jax.Array) -> Transition:
+    """The same, each by chance as a mirror shows it; ``key`` is consumed."""
+    flip = jax.random.bernoulli(key, shape=batch.action.shape)
+    obs, privileged = map(jnp.array, env.mirrored)
+    one = jnp.ones(())
+    wanted = None if batch.wanted is None else -one
+    signs = Transition(obs, privileged, -one, one, obs, privileged, wanted)
+
+    def seen(value, sign):
+        there = jnp.expand_dims(flip, tuple(range(flip.ndim, value.ndim)))
+        return value * jnp.where(there, sign, 1)
+
+    return jax.tree.map(seen, batch, signs)

@@ -1,0 +1,154 @@
+"""The stages of ``jaxpend sac``: imitation of demonstrations, and SAC itself."""
+
+from functools import partial
+from typing import Any, Self
+
+import jax
+
+from ..boards import Task
+from ..config import Run, SACConfig
+from ..controller import Controller
+from ..pytree import Pytree, pytree
+from ..score import nominal
+from ..stage import Chart, Stage
+from . import algorithm
+from .algorithm import Agent, SACState
+from .demonstrations import Imitation as Learner
+
+__all__ = ["SAC", "Imitation", "ImitationState"]
+
+
+@pytree
+class ImitationState(Pytree):
+    """SAC before its first step, and the actor that imitates."""
+
+    sac: SACState
+    learner: Learner
+
+
+class Imitation(Stage[None, ImitationState, SACState]):
+    """The actor imitates demonstrations."""
+
+    name, title, unit, column = "imitation", "Imitation", "updates", "updates"
+    charts = (Chart("Squared error", {"loss": "loss"}, "of the action", True),)
+    CHUNK = 2000  # updates
+
+    def __init__(self, config: SACConfig, task: Task):
+        self.agent, self.total = Agent(config, task), config.demonstrations.updates
+
+    @classmethod
+    def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
+        config = getattr(run, "sac", None)
+        return cls(config, task) if config and config.demonstrations.episodes else None
+
+    def start(self, seed: int, before: None) -> ImitationState:
+        return self._state(*algorithm.begin(self.agent, jax.random.key(seed)))
+
+    def like(self) -> ImitationState:
+        return self._state(*algorithm.structure(self.agent))
+
+    @staticmethod
+    def _state(state: SACState, learner: Learner | None) -> ImitationState:
+        assert learner is not None  # there are demonstrations: ``of``
+        return ImitationState(state, learner)
+
+    def policy_like(self) -> Controller | None:
+        return None
+
+    def done(self, state: ImitationState) -> int:
+        return int(state.learner.done)
+
+    def advance(self, states: list[ImitationState]) -> list[tuple[ImitationState, dict[str, Any]]]:
+        count = min(self.CHUNK, self.total - self.done(states[0]))
+        after = []
+        for state in states:
+            learner, loss = algorithm.imitate_chunk(self.agent, state.sac, state.learner, count)
+            after.append((state.replace(learner=learner), {"loss": loss}))
+        return after
+
+    def judge(
+        self, state: ImitationState, metrics: dict[str, Any]
+    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
+        return metrics, []
+
+    def note(self, row: dict[str, Any]) -> str:
+        return f"loss {float(row['loss']):.5f}"
+
+    def watched(self, state: ImitationState) -> Any:
+        return state.learner.params, state.learner.opt_state
+
+    def rekey(self, state: ImitationState, number: int) -> ImitationState:
+        key = jax.random.fold_in(state.learner.key, number)
+        return state.replace(learner=state.learner.replace(key=key))
+
+    def outcome(self, state: ImitationState, best: Controller | None) -> SACState:
+        return state.sac.replace(actor=state.learner.params)
+
+
+class SAC(Stage[SACState | None, SACState, Controller]):
+    """SAC on the surrogate reward; judged by the official score."""
+
+    name, title, unit, column = "sac", "SAC", "environment steps", "env_steps"
+    heading, scores = "after SAC", ("score",)
+    charts = (
+        Chart("Official score", {"best so far": "best", "now": "score"}, "v2 score"),
+        Chart("Reward", {"reward": "reward"}, "mean of a step"),
+        Chart("Temperature", {"temperature": "temperature"}, log=True),
+        Chart("Entropy of the policy", {"entropy": "entropy"}, "nats"),
+        Chart("Loss of the critics", {"loss": "critic_loss"}, log=True),
+        Chart("Loss of the actor", {"loss": "actor_loss"}),
+    )
+    ties = True  # they happen before the first success: the later policy has learned more
+
+    def __init__(self, config: SACConfig, task: Task):
+        self.agent, self.task, self.total = Agent(config, task), task, config.steps
+        self.vector_steps = max(config.eval_every // config.num_envs, 1)
+
+    @classmethod
+    def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
+        config = getattr(run, "sac", None)
+        return cls(config, task) if config else None
+
+    def start(self, seed: int, before: SACState | None) -> SACState:
+        if before is not None:
+            return before
+        return algorithm.begin(self.agent, jax.random.key(seed))[0]
+
+    def like(self) -> SACState:
+        return algorithm.structure(self.agent)[0]
+
+    def policy_like(self) -> Controller | None:
+        return jax.eval_shape(partial(algorithm.greedy_policy, self.agent), self.like())
+
+    def done(self, state: SACState) -> int:
+        return int(state.env_steps)
+
+    def advance(self, states: list[SACState]) -> list[tuple[SACState, dict[str, Any]]]:
+        # The last chunk is as long as what is left, in whole steps of all environments.
+        left = -(-(self.total - self.done(states[0])) // self.agent.config.num_envs)
+        steps = min(self.vector_steps, left)
+        if len(states) == 1:
+            return [algorithm.train_chunk(self.agent, states[0], steps)]
+        return algorithm.train_chunks(self.agent, states, steps)
+
+    def judge(
+        self, state: SACState, metrics: dict[str, Any]
+    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
+        policy = algorithm.greedy_policy(self.agent, state)
+        c = nominal(policy, self.task)
+        score = float(self.task.score(c))
+        row = {"updates": int(state.updates), "score": score, "uptime": c.uptime, **metrics}
+        return row, [(policy, score)]
+
+    def note(self, row: dict[str, Any]) -> str:
+        return f"reward {float(row['reward']):.2f}  score {row['score']:.3f}"
+
+    def watched(self, state: SACState) -> Any:
+        return state.replace(demonstrations=None)
+
+    def rekey(self, state: SACState, number: int) -> SACState:
+        return state.replace(key=jax.random.fold_in(state.key, number))
+
+    def outcome(self, state: SACState, best: Controller | None) -> Controller:
+        assert best is not None
+        return best

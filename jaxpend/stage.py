@@ -1,0 +1,176 @@
+"""What a stage of training is: a typed state that moves on in chunks and is judged in between.
+
+A stage is one class. It says all that others need to know of it: how far it goes, what counts,
+its charts and its headings (``Stage.about``). A run writes that into its folder, where the list
+of runs, the report and TensorBoard read it. All that a stage needs to go on is in its state, so
+that a checkpoint of the state is a checkpoint of the stage. Chunks do not depend on time, only on
+the configuration.
+"""
+
+from functools import partial
+from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
+
+import jax
+
+from .boards import Task
+from .config import GradientConfig, Run, SNESConfig
+from .controller import Controller
+from .pytree import Pytree, pytree
+from .score import imperfect, nominal
+
+__all__ = ["Chart", "SearchStage", "SearchState", "Stage", "value"]
+
+Before = TypeVar("Before")  # what a stage starts from
+State = TypeVar("State")  # what it changes, a pytree
+After = TypeVar("After")  # what the next stage starts from
+
+
+class Chart(NamedTuple):
+    """A learning curve of a stage; what counts is on x."""
+
+    title: str
+    curves: dict[str, str]  # label -> column of the metrics; "best" is the best score so far
+    ylabel: str = ""
+    log: bool = False
+
+
+class Stage(Generic[Before, State, After]):
+    """What the stages share; every method is pure."""
+
+    name: ClassVar[str]  # in metrics, file names and results
+    title: ClassVar[str]  # for people
+    unit: ClassVar[str]  # what ``done`` counts
+    column: ClassVar[str]  # the same in the metrics
+    heading: ClassVar[str] = ""  # of its official score; empty: it makes no controllers
+    charts: ClassVar[tuple[Chart, ...]] = ()
+    scores: ClassVar[tuple[str, ...]] = ()  # columns of the metrics with official scores
+    ties: ClassVar[bool] = False  # whether a policy as good as the best replaces it
+
+    total: int
+
+    @classmethod
+    def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
+        """The stage that a configuration has; None: it has no such stage.
+
+        ``start`` is a controller of the structure that the stage before ends with.
+        """
+        raise NotImplementedError
+
+    def about(self) -> dict[str, Any]:
+        """What others need to know of it, as plain values."""
+        names = ("name", "title", "unit", "column", "total", "heading", "charts", "scores")
+        return {name: getattr(self, name) for name in names}
+
+    def start(self, seed: int, before: Before) -> State:
+        """The state before the first chunk; ``before`` is the ``outcome`` of the last stage."""
+        raise NotImplementedError
+
+    def like(self) -> State:
+        """A state without numbers: the structure that checkpoints are read into."""
+        raise NotImplementedError
+
+    def policy_like(self) -> Controller | None:
+        """The same of a controller that it makes; None: it makes none."""
+        raise NotImplementedError
+
+    def done(self, state: State) -> int:
+        """How much of ``total`` is done."""
+        raise NotImplementedError
+
+    def advance(self, states: list[State]) -> list[tuple[State, dict[str, Any]]]:
+        """The next chunk of one run, or of several at the same step; states and metrics."""
+        raise NotImplementedError
+
+    def judge(
+        self, state: State, metrics: dict[str, Any]
+    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
+        """A row of metrics, and controllers with their scores, the last one of training first."""
+        raise NotImplementedError
+
+    def note(self, row: dict[str, Any]) -> str:
+        """What a row of metrics says, for people."""
+        raise NotImplementedError
+
+    def watched(self, state: State) -> Any:
+        """What has to be finite, besides the metrics."""
+        raise NotImplementedError
+
+    def rekey(self, state: State, number: int) -> State:
+        """The same state, to go on from with other random numbers."""
+        raise NotImplementedError
+
+    def outcome(self, state: State, best: Controller | None) -> After:
+        """What the next stage starts from."""
+        raise NotImplementedError
+
+
+# --- searches on the score -----------------------------------------------------------------
+
+# Of the scenarios on which candidates are compared: no seed of a run, and no key of the benchmark.
+VALIDATION_SEED = 2**31 - 1
+
+
+@partial(jax.jit, static_argnames=("task", "count"))
+def _validation(controller: Controller, task: Task, count: int) -> jax.Array:
+    """Mean score over random imperfect scenarios, always the same."""
+    key = jax.random.key(VALIDATION_SEED)
+    return task.score(imperfect(controller, task, key, count)).mean()
+
+
+def value(
+    config: GradientConfig | SNESConfig, controller: Controller, score: float, task: Task
+) -> float:
+    """What candidates are compared by, given their official score.
+
+    It is the score itself; of a search that meets scenarios its weighted mean with the mean score
+    over ``config.validation`` of them, which stay the same.
+    """
+    if not config.scenarios:
+        return score
+    weight = config.scenario_weight
+    return (1 - weight) * score + weight * float(_validation(controller, task, config.validation))
+
+
+@pytree
+class SearchState(Pytree):
+    """A search on a controller's parameters."""
+
+    start: Controller  # the origin of the coordinates, and all that is not searched
+    search: Any  # GradientState or SNESState
+    done: jax.Array  # () int, steps or generations
+    fresh: jax.Array | None = None  # key of the noise that only judges, where there is such
+
+
+class SearchStage(Stage[Controller, SearchState, Controller]):
+    """What the gradient and SNES share: they go on from a controller, and end with the best."""
+
+    config: Any
+    task: Task
+    policy: Controller  # of the structure that is searched
+
+    def policy_like(self) -> Controller:
+        return self.policy
+
+    def done(self, state: SearchState) -> int:
+        return int(state.done)
+
+    def chunk(self, state: SearchState) -> int:
+        """Steps of the next chunk."""
+        return min(self.config.chunk, self.total - self.done(state))
+
+    def moved(self, state: SearchState, search: Any, count: int) -> SearchState:
+        """The state ``count`` steps later."""
+        return state.replace(search=search, done=state.done + count)
+
+    def compared(self, controller: Controller) -> tuple[float, float]:
+        """The official score of a candidate, and what it is compared by."""
+        score = float(self.task.score(nominal(controller, self.task)))
+        return score, value(self.config, controller, score, self.task)
+
+    def rekey(self, state: SearchState, number: int) -> SearchState:
+        key = jax.random.fold_in(state.search.key, number)
+        return state.replace(search=state.search.replace(key=key))
+
+    def outcome(self, state: SearchState, best: Controller | None) -> Controller:
+        assert best is not None
+        return best
