@@ -52,7 +52,7 @@ STRATEGIES = {  # and what evosax calls them
     "open_es": "Open_ES",
 }
 
-Duration = Annotated[float, Bounds(least=0.01)]  # s
+Duration = Annotated[float, Bounds(least=0.01, most=3600)]  # s
 PositiveOrInfinite = Annotated[float, Bounds(above=0, infinite=True)]
 
 # The paper's heights of the end effector above which the reward asks for balance, m.
@@ -239,7 +239,8 @@ class Run(Checked):
     plant: str = ""  # file of the parameters of another plant; empty: that of the boards
     design: str = ""  # or an identified one by name, such as C.1/1.0
     seed: Seed = 0
-    seeds: Count = 1  # how many runs, of the seeds from ``seed`` on, each in RUN/seedN
+    # How many runs, of the seeds from ``seed`` on, each in RUN/seedN.
+    seeds: Annotated[int, Bounds(above=0, most=1000)] = 1
     # Several seeds in one computation; auto: on an accelerator.
     vmap: Literal["auto", "yes", "no"] = "auto"
     run: str = ""  # name of the run folder; empty: ROBOT-seedSEED, or ROBOT-snes-seedSEED

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .errors import JaxpendError, blame
+from .errors import THEIRS, JaxpendError, blame
 from .pytree import Pytree, pytree, static
 from .robots import ROBOTS
 
@@ -119,7 +119,7 @@ def _check_call(structure: Any, forms: tuple[tuple[Any, Any], ...], _precision: 
         carry, returned = jax.eval_shape(first_call, controller)
     except JaxpendError:
         raise
-    except Exception as error:  # the controller is the user's, and may raise anything
+    except THEIRS as error:
         raise JaxpendError(f"{name} cannot be called: {blame(error)}") from error
     if not (isinstance(returned, tuple) and len(returned) == 2):
         raise JaxpendError(f"{name} returns {type(returned).__name__}, not (carry, torque)")

@@ -3,8 +3,10 @@
 import os
 import traceback
 
-__all__ = ["JaxpendError", "blame", "choose"]
+__all__ = ["THEIRS", "JaxpendError", "blame", "choose"]
 
+# What a user's own code may raise: anything, and to leave the program is not what it is asked for.
+THEIRS = (Exception, SystemExit)
 
 # Where files begin whose lines are not a user's: this package, Python's own modules, frozen ones.
 NOT_THEIRS = (*(os.path.join(os.path.dirname(m), "") for m in (__file__, os.__file__)), "<frozen")

@@ -149,6 +149,8 @@ def _fitted(hint: Any, value: Any, text: bool) -> Any:
             raise _Unfit(value, f"be {described(kind)}")
         return value
     given = value
+    if value == "" and (optional or kind is Path):
+        raise _Unfit(value, "not be empty")
     if text and isinstance(value, str):
         value = _from_text(kind, value)
     if kind in (int, float):

@@ -34,9 +34,14 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     """A file to write, which takes the place of ``path`` in one step when all went well.
 
     A reader, or a crash, sees the old content or the new, whole. What a killed process leaves
-    has a name that ``TEMPORARY`` matches and nothing else has.
+    has a name that ``TEMPORARY`` matches and nothing else has. A device or a pipe is written to,
+    not replaced.
     """
     path = Path(path)
+    if path.exists() and not path.is_file() and not path.is_dir():
+        with path.open("wb") as file:
+            yield file
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.jaxpend-tmp-{os.getpid()}")
     try:

@@ -16,7 +16,8 @@ class _Console(Console):
 
 
 # Progress and tables go to standard error, so that standard output stays machine-readable.
-console = _Console(stderr=True)
+# Nothing is markup: names of files hold brackets.
+console = _Console(stderr=True, markup=False, emoji=False, highlight=False)
 if console.width < 40:  # no room for the tables: let the terminal break their lines
     console.width = 80
 
@@ -46,7 +47,7 @@ class LiveProgress:
     def __enter__(self):
         self.bar.__enter__()
         if not console.is_terminal:
-            console.print(f"{self.title}: {self.note}", highlight=False)
+            console.print(f"{self.title}: {self.note}")
         return self
 
     def __exit__(self, *exception):
@@ -58,4 +59,4 @@ class LiveProgress:
         if not console.is_terminal:
             seconds = time.perf_counter() - self.started
             line = f"{self.title} {done:,}/{self.total:,}  {seconds:.0f} s  {note}"
-            console.print(line, highlight=False, soft_wrap=True)
+            console.print(line, soft_wrap=True)

@@ -3,6 +3,8 @@
 import contextlib
 import dataclasses
 import importlib
+import logging
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -86,9 +88,9 @@ COMMANDS = {
 def one_sentence(prog: str) -> Iterator[None]:
     """Turn what goes wrong in a command into one sentence on standard error and an exit code.
 
-    2 for a ``JaxpendError`` or an unusable file system, 130 after Ctrl-C, 143 after SIGTERM where
-    a loop waits for a good moment to stop (``train.interrupt``); and, without a word, 141 where
-    nobody reads the output any more, as of a program that SIGPIPE kills.
+    2 for a ``JaxpendError``, an unusable file system or too little memory, 130 after Ctrl-C, 143
+    after SIGTERM where a loop waits for a good moment to stop (``train.interrupt``); and, without
+    a word, 141 where nobody reads the output any more, as of a program that SIGPIPE kills.
     """
     try:
         yield
@@ -102,13 +104,29 @@ def one_sentence(prog: str) -> Iterator[None]:
     except OSError as error:
         where = f" {error.filename}" if error.filename else ""
         code, text = 2, f"cannot use{where}: {error.strerror or error}"
+    except (MemoryError, RuntimeError) as error:
+        code, text = 2, in_words(error)
+        if not text:
+            raise
     except KeyboardInterrupt as stop:
         code, text = 128 + getattr(stop, "signum", signal.SIGINT), str(stop) or "interrupted"
     if text and sys.stderr is not None:
+        # In one line, whatever a name in it holds.
+        text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
         with contextlib.suppress(OSError):
             print(f"{prog}: {text}", file=sys.stderr)
     drop_unwritable()
     sys.exit(code)
+
+
+def in_words(error: MemoryError | RuntimeError) -> str:
+    """What numpy or jax say in an error that is no bug of this package; empty for one that is."""
+    text = str(error)
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in text:
+        return f"there is too little memory: {text.partition(chr(10))[0] or 'ask for less'}"
+    # What a Python function has done in a compiled loop: jax gives its traceback as text.
+    refused = re.findall(r"^(?:[\w.]+\.)?JaxpendError: (.+)$", text, re.MULTILINE)
+    return refused[-1] if refused else ""
 
 
 def main(*prefix: str) -> NoReturn:
@@ -148,6 +166,8 @@ def run(
             compile_cache()
             if computes:
                 check_platform()
+                # It prints the traceback of a user's function, which becomes a sentence here.
+                logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)
         call()
     sys.exit(0)
 

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ..config import GradientRun, Run, SACRun, Search, SNESRun, TrainRun
 from ..fields import Count, Natural, Positive, Robot, Seed
-from ..files import write_atomically
-from .output import check_file, check_folder, emit_json
+from .output import check_file, check_folder, emit, emit_json
 
 if TYPE_CHECKING:
     import jax
@@ -70,7 +69,7 @@ def execute(config: Run, command: str) -> None:
         seeds_table(result)
     else:
         score_table(read_run(config.folder).results, board)
-    console.print(f"policy.npz, metrics and result are in [bold]{config.folder}[/bold]")
+    console.print(f"policy.npz, metrics and result are in {config.folder}", soft_wrap=True)
 
 
 def _board(robot: str, plant: str | None, design: str | None) -> "Board":
@@ -118,12 +117,12 @@ def report(run: Path, /, out: Path | None = None, robustness: bool = True) -> No
 
     found = find(run)
     for sentence in remarks(found):
-        console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+        console.print(sentence, soft_wrap=True)
     from ..report.page import write
 
     page = write(found, folder, title=run.resolve().name, robustness=robustness)
-    line = f"the report is {page}; pictures are in {page.with_suffix('')}"
-    console.print(line, highlight=False, markup=False, soft_wrap=True)
+    pictures = page.with_suffix("")
+    console.print(f"the report is {page}; pictures are in {pictures}", soft_wrap=True)
 
 
 def score(
@@ -154,12 +153,12 @@ def score(
     from ..score import official
     from .tables import score_table
 
-    board = _board(robot, plant, design)
+    board, file = _board(robot, plant, design), policy or (None if controller else robot)
+    about = {"policy": file, "controller": controller, "plant": plant, "design": design}
+    about["header"] = read_header(file) if file else None
     with jax.enable_x64(True):
         judged = find_controller(policy, controller, board.task)
-    file = policy or (None if controller else robot)
-    result = official(judged, board) | {"policy": file, "controller": controller}
-    result |= {"plant": plant, "design": design, "header": read_header(file) if file else None}
+    result = official(judged, board) | about
     if json != "-":
         score_table({controller or policy or f"shipped {robot}": result}, board)
     emit_json(result, json)
@@ -273,7 +272,7 @@ def leaderboard(
         keys: repetitions of what the benchmark draws at random; the median counts.
         seed: of the benchmark's first key.
         json: write the result as JSON to this file, or "-" for standard output.
-        out: write the table as Markdown to this file.
+        out: write the table as Markdown to this file, or "-" for standard output.
     """
     check_file(json)
     check_file(out)
@@ -290,8 +289,7 @@ def leaderboard(
     result |= {"plant": plant, "design": design}
     leaderboard_table(result, board)
     emit_json(result, json)
-    if out is not None:
-        write_atomically(out, boards.markdown(result))
+    emit(boards.markdown(result), out)
 
 
 def optimise(

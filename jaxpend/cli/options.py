@@ -180,6 +180,8 @@ class _Parser(argparse.ArgumentParser):
         end = [*args, "--"].index("--")  # behind it are no options
         given, rest = self.parse_known_args([*map(_spelled, args[:end]), *args[end:]])
         for word in rest:
+            if word == "--":
+                continue
             name = word.partition("=")[0]
             if name.startswith("-") and name != "-":
                 raise JaxpendError(f"unknown option {name}; {similar(name, self.known, self.prog)}")

@@ -8,23 +8,25 @@ from typing import Any
 from ..errors import JaxpendError
 from ..files import to_json, write_atomically
 
-__all__ = ["check_file", "check_folder", "drop_unwritable", "emit_json"]
+__all__ = ["check_file", "check_folder", "drop_unwritable", "emit", "emit_json"]
+
+
+def emit(text: str, target: str | Path | None) -> None:
+    """Write text to standard output ("-") or, atomically, to a file; None: nowhere."""
+    if str(target) == "-":
+        check_file("-")
+        sys.stdout.write(text)
+    elif target is not None:
+        write_atomically(target, text)
 
 
 def emit_json(value: Any, target: str | Path | None) -> None:
-    """Write ``value`` as JSON to standard output ("-") or, atomically, to a file; None: nowhere."""
-    if target is None:
-        return
-    text = to_json(value, indent=2) + "\n"
-    if str(target) != "-":
-        write_atomically(target, text)
-        return
-    check_file("-")
-    sys.stdout.write(text)
+    """``emit`` a value as JSON."""
+    emit(to_json(value, indent=2) + "\n", target)
 
 
 def check_file(path: str | Path | None) -> None:
-    """Raise ``JaxpendError`` if a file could not be written; None and "-" are as in ``emit_json``.
+    """Raise ``JaxpendError`` if a file could not be written; None and "-" are as in ``emit``.
 
     Commands ask before they compute, so that a mistyped name does not cost minutes.
     """

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich import box
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from ..terminal import console
 
@@ -29,11 +29,11 @@ def score_table(results: Mapping[str, Mapping], board: "Board") -> None:
     table.add_column("")
     for name in results:
         table.add_column(name, justify="right")
-    table.add_row("score", *(f"[bold]{r['score']:.4f}[/bold]" for r in results.values()))
+    table.add_row("score", *(Text(f"{r['score']:.4f}", "bold") for r in results.values()))
     table.add_row("success", *("yes" if r.get("success") else "no" for r in results.values()))
     for key, (heading, unit, form) in HEADINGS.items():
         cells = (format(r["criteria"][key], form) for r in results.values())
-        table.add_row(f"{heading} \\[{unit}]", *cells)
+        table.add_row(f"{heading} [{unit}]", *cells)
     console.print(table)
     if board.published:
         published = ", ".join(f"{title} {score:.3f}" for title, score, _ in board.published)
@@ -56,7 +56,7 @@ def robustness_table(result: Mapping[str, Any], board: "Board") -> None:
         score = f"{100 * result['scores'][name]:.1f}"
         table.add_row(CRITERIA.get(name, name), score, spread, str(found["diverged"]))
     spread = f"{100 * over['mean']:.1f} ± {100 * over['std']:.1f}" if several else ""
-    table.add_row("Overall", f"[bold]{100 * result['overall']:.1f}[/bold]", spread, "")
+    table.add_row("Overall", Text(f"{100 * result['overall']:.1f}", "bold"), spread, "")
     console.print(table)
     seconds = f"{result['run_seconds']:.1f} s for {len(over['overall'])} key" + "s" * several
     median = "scores are medians over the keys; " if several else ""
@@ -100,12 +100,13 @@ def runs_table(entries: Sequence[Mapping[str, Any]]) -> None:
         table.add_column(heading, justify="right" if right else "left", overflow="fold")
     for run in entries:
         seed = f"{len(run['seed'])} seeds" if "runs" in run else run["seed"]
-        state = f"[{COLOURS[run['state']]}]{run['state']}[/]"
+        at = f": {run['at']}" if run["at"] else ""
+        state = Text.assemble((run["state"], COLOURS[run["state"]]), at)
         date = datetime.datetime.fromisoformat(run["changed"])
         table.add_row(
-            escape(run["run"]), run["robot"] or "", ", ".join(s.upper() for s in run["stages"]),
+            run["run"], run["robot"] or "", ", ".join(s.upper() for s in run["stages"]),
             "" if seed is None else str(seed),
-            f"{state}: {run['at']}" if run["at"] else state,
+            state,
             "" if run["score"] is None else f"{run['score']:.4f}",
             "" if run["seconds"] is None else f"{run['seconds']:.0f} s",
             f"{date:%d %b %H:%M}",

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..controller import Memoryless
-from ..errors import JaxpendError, blame
+from ..errors import THEIRS, JaxpendError, blame
 from ..pytree import pytree, static
 
 __all__ = ["PythonLaw"]
@@ -39,7 +39,7 @@ class PythonLaw(Memoryless):
                 times, states = t.ravel(), x.reshape(-1, 4)
                 u = [self.law(float(a), b) for a, b in zip(times, states, strict=True)]
             torque = np.asarray(u, x.dtype)
-        except Exception as error:  # the law is the user's, and may raise anything
+        except THEIRS as error:
             raise JaxpendError(f"{name} cannot be called: {blame(error)}") from None
         if torque.shape != (t.size, 2):
             shape = torque.shape if self.batched else torque.shape[1:]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from ..boards import Task
 from ..controller import Controller, OpenLoop, check_controller, check_robot
-from ..errors import JaxpendError, blame, choose
+from ..errors import THEIRS, JaxpendError, blame, choose
 from ..plant import Plant
 from ..trajopt.reference import load_reference
 from .callback import PythonLaw
@@ -104,14 +104,13 @@ def find_controller(policy: str | Path | None, controller: str | None, task: Tas
         own = _imported(controller)
         check_robot(own, robot)
         return load_controller(policy, robot=robot, classes=classes_of(own)) if policy else own
-    found = build(controller, task.plant, robot)
     if not policy:
-        return found
+        return build(controller, task.plant, robot)
+    # What may be wrong comes first: some controllers take a while to build.
     given = network_in(load_policy(policy, robot=robot), policy)
-    found, policies = change_policies(found, lambda shipped: given)
-    if not policies:
+    if not choose("controller", controller, CATALOGUE).startswith("policy"):
         raise JaxpendError(f"{controller} is not built around a policy; leave out {policy}")
-    return found
+    return change_policies(build(controller, task.plant, robot), lambda shipped: given)[0]
 
 
 def _imported(name: str) -> Controller:
@@ -119,9 +118,9 @@ def _imported(name: str) -> Controller:
     sys.path.insert(0, str(Path.cwd()))
     try:
         found = getattr(importlib.import_module(module), attribute)
-    except Exception as error:  # the module is the user's, and may raise anything
+        if not isinstance(found, type) and not hasattr(found, "reset") and callable(found):
+            found = PythonLaw(found)
+    except THEIRS as error:
         raise JaxpendError(f"cannot load {name} as module:name: {blame(error)}") from None
-    if not isinstance(found, type) and not hasattr(found, "reset") and callable(found):
-        found = PythonLaw(found)
     check_controller(found)
     return found

@@ -9,13 +9,14 @@ import math
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from ..config_files import read_yaml
 from ..errors import JaxpendError, choose
+from ..fields import Bounds, NotNegative, Positive, checked
 from ..plant import Plant
 from ..robots import ROBOTS, active_joint
 
@@ -37,7 +38,12 @@ _OPTIONAL = {
     "b1": 0.0, "b2": 0.0, "cf1": 0.0, "cf2": 0.0, "tl1": math.inf, "tl2": math.inf,
     "g": 9.81, "Ir": 0.0, "gr": 6.0,
 }  # fmt: skip
-_POSITIVE = ("m1", "m2", "l1", "l2", "r1", "r2", "I1", "I2", "gr")
+# What a parameter may be; the others must be positive.
+_KINDS: dict[str, Any] = {
+    **dict.fromkeys(("b1", "b2", "cf1", "cf2", "Ir"), NotNegative),
+    **dict.fromkeys(("tl1", "tl2"), Annotated[float, Bounds(least=0, infinite=True)]),
+    "g": float,
+}
 
 
 def _table() -> dict[str, dict[str, dict[str, float]]]:
@@ -68,7 +74,7 @@ def from_dict(
         torque_limit: limit of the driven joint in N m, in place of ``tl1``/``tl2``.
 
     Raises:
-        JaxpendError: missing, unknown, non-finite or non-positive parameters.
+        JaxpendError: missing or unknown parameters, or values that no plant has.
     """
     if not isinstance(parameters, Mapping):
         raise JaxpendError("plant parameters must be a mapping such as {m1: 0.5, l1: 0.2, ...}")
@@ -76,17 +82,10 @@ def from_dict(
         raise JaxpendError(f"plant parameters lack {', '.join(missing)}")
     for key in parameters:
         choose("plant parameter", key, (*_REQUIRED, *_OPTIONAL))
-    try:
-        p = {k: float(v) for k, v in {**_OPTIONAL, **parameters}.items()}
-    except (TypeError, ValueError) as error:
-        raise JaxpendError(f"plant parameters must be numbers: {error}") from None
-    for key, value in p.items():
-        if math.isnan(value) or (math.isinf(value) and not key.startswith("tl")):
-            raise JaxpendError(f"plant parameter {key} is {value}; it must be finite")
-        if key in _POSITIVE and value <= 0:
-            raise JaxpendError(f"plant parameter {key} is {value}; it must be positive")
-        if key.startswith("tl") and value < 0:
-            raise JaxpendError(f"torque limit {key} is {value} N m; it must not be negative")
+    p = {
+        k: checked(_KINDS.get(k, Positive), v, f"plant parameter {k}", text=True)
+        for k, v in {**_OPTIONAL, **parameters}.items()
+    }
     limit, actuation = np.array([p["tl1"], p["tl2"]]), np.ones(2)
     if robot is not None:
         actuation = np.arange(2) == active_joint(robot)
@@ -115,7 +114,7 @@ def read(path: str | Path) -> dict[str, float]:
         from_dict(parameters)
     except JaxpendError as error:
         raise JaxpendError(f"{path}: {error}") from None
-    return dict(parameters)
+    return {name: float(value) for name, value in parameters.items()}
 
 
 def from_file(path: str | Path, **kwargs) -> Plant:
