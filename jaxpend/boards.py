@@ -25,18 +25,9 @@ if TYPE_CHECKING:
     from .rollout import Trajectory
 
 __all__ = [
-    "CRITERIA",
-    "HEADINGS",
-    "V2",
-    "Board",
-    "Strip",
-    "Task",
-    "board",
-    "own_task",
-    "strips",
-    "task_of",
-    "v2",
-]
+    "CRITERIA", "HEADINGS", "V2", "Board", "Strip", "Task", "board", "own_task", "strips",
+    "task_of", "v2",
+]  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,15 +30,9 @@ from .score import imperfect, performance
 from .stage import Chart, SearchStage, SearchState
 
 __all__ = [
-    "SNES",
-    "SNESConfig",
-    "SNESState",
-    "best_controller",
-    "evolve",
-    "fitness",
-    "init",
+    "SNES", "SNESConfig", "SNESState", "best_controller", "evolve", "fitness", "init",
     "mean_controller",
-]
+]  # fmt: skip
 
 STRATEGIES = {name: getattr(algorithms, kind) for name, kind in config.STRATEGIES.items()}
 

@@ -34,13 +34,8 @@ from .riccati import Riccati
 from .tvlqr import TVLQR
 
 __all__ = [
-    "classes_of",
-    "load_controller",
-    "load_policy",
-    "read_header",
-    "save_controller",
-    "save_policy",
-]
+    "classes_of", "load_controller", "load_policy", "read_header", "save_controller", "save_policy",
+]  # fmt: skip
 
 FORMAT = 1
 # What files of earlier versions call classes and fields.
