@@ -190,8 +190,7 @@ def v2(robot: str) -> Board:
 def own_task(controller: Any, task: Task | None = None) -> Task:
     """``task``, or where there is none that of the v2 board of the robot a controller is for.
 
-    Raises:
-        JaxpendError: the controller does not say which robot it is for.
+    Raises ``JaxpendError`` if the controller does not say which robot it is for.
     """
     if task is not None:
         return task

@@ -118,9 +118,11 @@ def _check_call(structure: Any, forms: tuple[tuple[Any, Any], ...], _precision: 
     if getattr(torque, "shape", None) != (2,):
         shape = getattr(torque, "shape", type(torque).__name__)
         raise JaxpendError(f"{name} returns a torque of shape {shape}; it must be (2,)")
-    forms = [(jax.tree.structure(tree), [leaf.shape for leaf in jax.tree.leaves(tree)])
-             for tree in (carry, after)]  # fmt: skip
-    if forms[0] != forms[1]:
+    memories = [
+        (jax.tree.structure(tree), [leaf.shape for leaf in jax.tree.leaves(tree)])
+        for tree in (carry, after)
+    ]
+    if memories[0] != memories[1]:
         raise JaxpendError(f"{name} returns a memory of another form than that of its reset")
 
 

@@ -1,8 +1,9 @@
 """The analytic gradient of a smooth form of the official score, through the simulator.
 
-The closed loop is differentiated from end to end: what a parameter does to the score seconds
-later is known, not sampled. Adam (Kingma and Ba, 2015) climbs from a trained policy, or from any
-other controller that declares what may be searched (``controllers/search_space.py``),
+The closed loop is differentiated from end to end, so that the effect of a parameter on the score
+seconds later is computed and not estimated from samples. Adam (Kingma and Ba, 2015) climbs from a
+trained policy, or from any other controller that declares what may be searched
+(``controllers/search_space.py``),
 
     (1 - w) smooth v2 score of the nominal run + w mean upright time of random scenarios
 
@@ -12,8 +13,8 @@ over a run and over imperfect scenarios (``variations.sample``, new ones every s
 
 Where motion is chaotic the gradient explodes and says nothing. Therefore the window is
 ``duration`` long, the norm of each run's gradient is clipped before they are averaged, a run
-whose gradient is not finite is left out and counted, and in scenarios what a state does to later
-ones fades from the gradient (``memory``).
+whose gradient is not finite is left out and counted, and in scenarios the effect of a state on
+later states fades from the gradient, with the time constant ``memory``.
 """
 
 import math
@@ -65,8 +66,8 @@ def _fading(memory: float):
 def performance(config: GradientConfig, controller: Controller, task: Task) -> jax.Array:
     """Smooth score of the first ``config.duration`` s of the nominal run."""
     run = rollout(task.plant, controller, jax.random.key(0), dt=task.dt, duration=config.duration)
-    width = jnp.asarray(config.line_width), jnp.asarray(config.power_width)
-    p = SwingUp(task.plant, None, None, *width, task=task, dt=task.dt)
+    line, power = jnp.asarray(config.line_width), jnp.asarray(config.power_width)
+    p = SwingUp(task.plant, None, None, line, power, task, task.dt)
     return smooth_score(p, totals(p, run.x, run.u[:, task.joint]))
 
 

@@ -11,7 +11,8 @@ The equations of motion are
 (Spong, "The swing up control problem for the acrobot", 1995, with the reflected motor inertia
 and friction terms of Wiebe et al., "Open-source dual-purpose acrobot and pendubot platform",
 2023). Every function takes one plant and one state; use ``jax.vmap`` for batches of either.
-The 2x2 algebra is written out element by element: it fuses, and no matrix unit rounds it.
+The 2x2 algebra is written out element by element: XLA fuses it, and no device rounds it as it
+rounds matrix products.
 """
 
 import jax

@@ -130,8 +130,9 @@ def _check(scenario: Scenario | Plant, controller: Controller, delay_slots: int)
     if scenario.x0 is not None and (shape := jnp.shape(scenario.x0)) != (4,):
         text = f"x0 has shape {shape}; one rollout starts from (4,): vmap over batches of scenarios"
         raise JaxpendError(text)
-    known = scenario.delay is not None and not isinstance(scenario.delay, jax.core.Tracer)
-    if known and (longest := int(np.max(scenario.delay))) >= delay_slots:
+    known = None if isinstance(scenario.delay, jax.core.Tracer) else scenario.delay
+    longest = -1 if known is None else int(np.max(known))
+    if longest >= delay_slots:
         raise JaxpendError(
             f"a delay of {longest} steps does not fit in a buffer of {delay_slots} states; "
             f"pass delay_slots={longest + 1} or more"
@@ -175,24 +176,25 @@ def rollout(
     return _closed_loop(scenario, controller, key, *options, normals, record=True)
 
 
-_final_state = jax.jit(
-    _closed_loop, static_argnames=("dt", "duration", "integrator", "delay_slots")
-)
+DEFAULTS: dict[str, Any] = {
+    "dt": DT,
+    "duration": DURATION,
+    "integrator": rk4_step,
+    "delay_slots": 32,
+}
+_final_state = jax.jit(_closed_loop, static_argnames=tuple(DEFAULTS))
 
 
 def final_state(
-    scenario: Scenario | Plant,
-    controller: Controller,
-    key: jax.Array,
-    *,
-    dt: float = DT,
-    duration: float = DURATION,
-    integrator: Callable = rk4_step,
-    delay_slots: int = 32,
+    scenario: Scenario | Plant, controller: Controller, key: jax.Array, **options: Any
 ) -> jax.Array:
-    """Only the last true state of ``rollout``, shape (4,): no trajectory is kept in memory."""
-    scenario = _check(scenario, controller, delay_slots)
-    return _final_state(scenario, controller, key, dt, duration, integrator, delay_slots)
+    """Only the last true state of ``rollout``, shape (4,): no trajectory is kept in memory.
+
+    ``options`` and their defaults are those of ``rollout``, without ``normals``.
+    """
+    options = DEFAULTS | options
+    scenario = _check(scenario, controller, options["delay_slots"])
+    return _final_state(scenario, controller, key, **options)
 
 
 class _Rollout(types.ModuleType):

@@ -37,11 +37,7 @@ __all__ = [
 
 
 def performance(
-    controller: Controller,
-    scenario: Scenario | Plant,
-    key: jax.Array,
-    task: Task,
-    **options: Any,
+    controller: Controller, scenario: Scenario | Plant, key: jax.Array, task: Task, **options: Any
 ) -> Criteria:
     """Criteria of a run on the time grid of a task, on a plant or on a scenario around one.
 

@@ -1,6 +1,5 @@
 """An optimised swing-up to follow, and its file: plain arrays and a JSON header."""
 
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..arrays import read_arrays, write_arrays
-from ..designs import ROBOTS, active_joint
 from ..errors import JaxpendError, choose
 from ..pytree import Pytree, pytree, static
+from ..robots import ROBOTS, active_joint, shipped
 
 __all__ = ["Reference", "load_reference", "save_reference"]
 
@@ -36,8 +35,7 @@ class Reference(Pytree):
     @property
     def goal(self) -> jax.Array:
         """Upright, (4,), on the turn of theta1 and theta2 where the swing-up ends."""
-        turn = 2 * jnp.pi
-        upright = jnp.array([jnp.pi, 0.0], self.x.dtype)
+        turn, upright = 2 * jnp.pi, jnp.array([jnp.pi, 0.0], self.x.dtype)
         angles = upright + turn * jnp.round((self.x[-1, :2] - upright) / turn)
         return jnp.concatenate([angles, jnp.zeros(2, self.x.dtype)])
 
@@ -52,21 +50,10 @@ class Reference(Pytree):
 
 def save_reference(path: str | Path, reference: Reference, provenance: dict[str, Any]) -> None:
     """Write a trajectory file (.npz without pickle), atomically: float32, the torques float64."""
-    header = {
-        "format": FORMAT,
-        "kind": "swing-up",
-        "robot": reference.robot,
-        "dt": reference.dt,
-        "provenance": provenance,
-    }
+    header = {"format": FORMAT, "kind": "swing-up", "robot": reference.robot, "dt": reference.dt}
+    header["provenance"] = provenance
     arrays = {"x": np.asarray(reference.x, "f4"), "gain": np.asarray(reference.gain, "f4")}
     write_arrays(path, header, arrays | {"u": np.asarray(reference.u, "f8")})
-
-
-def _locate(robot_or_path: str | Path) -> Path:
-    if str(robot_or_path) not in ROBOTS:
-        return Path(robot_or_path)
-    return Path(str(resources.files("jaxpend").joinpath(f"trajectories/{robot_or_path}.npz")))
 
 
 def load_reference(robot_or_path: str | Path, *, robot: str | None = None) -> Reference:
@@ -77,7 +64,7 @@ def load_reference(robot_or_path: str | Path, *, robot: str | None = None) -> Re
     Raises:
         JaxpendError: no such file, not a trajectory file, or one for the other robot.
     """
-    path = _locate(robot_or_path)
+    path = shipped(robot_or_path, "trajectories")
     header, arrays = read_arrays(path, "trajectory")
     if header.get("kind") != "swing-up" or header.get("format") != FORMAT:
         raise JaxpendError(f"{path} is not a swing-up trajectory of format {FORMAT}")
