@@ -36,14 +36,12 @@ class TVLQR(Memoryless):
 
     def __call__(self, carry, t, x):
         """Torque (2,), N m: the step nearest to ``t``; past the last one, the LQR's."""
-        reference = self.reference
-        index = reference.index(t)
-        k = jnp.clip(index, 0, reference.steps - 1)
+        reference, limit = self.reference, self.top.torque_limit
+        k, underway = reference.at(t)
         torque = reference.u[k] - self.gain[k] @ deviation(x, reference.x[k])
-        limit = self.top.torque_limit
         tracking = jnp.clip(reference.both(torque), -limit, limit)
         _, holding = self.top(None, t, x)
-        return carry, jnp.where(index < reference.steps, tracking, holding)
+        return carry, jnp.where(underway, tracking, holding)
 
 
 @jax.jit

@@ -39,9 +39,10 @@ class Reference(Pytree):
         angles = upright + turn * jnp.round((self.x[-1, :2] - upright) / turn)
         return jnp.concatenate([angles, jnp.zeros(2, self.x.dtype)])
 
-    def index(self, t: jax.Array) -> jax.Array:
-        """Step that time ``t`` (s) falls on, not clipped to the horizon; int."""
-        return jnp.round(t / self.dt).astype(int)
+    def at(self, t: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The step nearest to time ``t`` (s), one of the N, and whether ``t`` is before the end."""
+        index = jnp.round(t / self.dt).astype(int)
+        return jnp.clip(index, 0, self.steps - 1), index < self.steps
 
     def both(self, torque: jax.Array) -> jax.Array:
         """A torque of the driven joint () as torques of both joints (2,)."""
