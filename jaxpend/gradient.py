@@ -121,8 +121,8 @@ def slope(config: GradientConfig, start: Controller, task: Task, z: jax.Array, k
 def _adam(config: GradientConfig, weights: np.ndarray) -> optax.GradientTransformation:
     """Adam, warmed up, then with cosine decay; weights and all else have step sizes of their own.
 
-    Adam's first steps are as long as all others, however small the gradient; without a warm-up
-    they lost the swing-up.
+    Adam's first steps are as long as later ones, even where the gradient is small; without a
+    warm-up they destroyed the swing-up.
     """
     rates = np.where(weights, config.learning_rate, config.gain_learning_rate)
     decay = optax.warmup_cosine_decay_schedule(
@@ -133,7 +133,7 @@ def _adam(config: GradientConfig, weights: np.ndarray) -> optax.GradientTransfor
 
 
 def init(config: GradientConfig, controller: Controller, key: jax.Array) -> GradientState:
-    """At the controller, before the first step. Raises as ``search_space.kinds``."""
+    """The state at the controller, before the first step. Raises as ``search_space.kinds``."""
     check_controller(controller)
     z, weights, _ = coordinates(controller, config.searched)
     return GradientState(z, _adam(config, weights).init(z), key, jnp.zeros((), jnp.int32))
@@ -166,7 +166,7 @@ def improve(
 
 
 def current(config: GradientConfig, start: Controller, state: GradientState) -> Controller:
-    """The controller where the ascent is."""
+    """The controller at the parameters that the ascent has reached."""
     return coordinates(start, config.searched)[-1](state.parameters)
 
 

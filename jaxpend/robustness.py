@@ -32,7 +32,7 @@ __all__ = [
     "success_map",
 ]  # fmt: skip
 
-KEYS = 3  # by default; of one key, runs at the edge move the robustness by up to 0.03
+KEYS = 3  # by default; with one key, runs at the edge of failure change the result by up to 0.03
 
 
 @dataclasses.dataclass(frozen=True)

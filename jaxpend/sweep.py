@@ -35,7 +35,7 @@ class Outcome(Pytree):
     x: jax.Array  # (n, 4) final state
     success: jax.Array  # (n,) bool, upright at the end
     diverged: jax.Array  # (n,) bool, not a number: a failure
-    score: jax.Array | None = None  # (n,) v2 score, 0 for a failure of its own rule
+    score: jax.Array | None = None  # (n,) v2 score; 0 where its own rule of success is not met
 
 
 @partial(jax.jit, static_argnames=("scored", "dt", "duration", "delay_slots"))

@@ -100,8 +100,8 @@ def _perturbation(scenario, values, keys):
     return scenario.replace(pulses=pulses.replace(amplitude=pulses.amplitude * scale))
 
 
-# How bad it gets on the v2 boards: the ends of every grid of the robustness benchmark. Those of
-# inertial parameters are factors of the nominal value.
+# The ends of the grids of the v2 boards' robustness benchmark. Those of inertial parameters are
+# factors of the nominal value.
 INERTIAL = (0.75, 1.25)
 RANGES: dict[str, tuple[float, float]] = {
     "Ir": (0.0, 1e-4),

@@ -94,8 +94,9 @@ def find_controller(policy: str | Path | None, controller: str | None, task: Tas
     Args:
         policy: a policy or controller file; None: the policy that ships with the package.
         controller: a name in the catalogue; or ``module:name``, a controller or a Python
-            function, looked for in the working directory too. With ``policy`` as well: that of
-            the catalogue around that policy, or a file of the classes of ``module:name``.
+            function, looked for in the working directory too. If ``policy`` is given too, the
+            controller of the catalogue is built around it, or the file that it names is loaded
+            with the classes of ``module:name``.
         task: gives the robot, and the nominal plant that a controller of the catalogue is for.
 
     Raises:

@@ -140,7 +140,7 @@ def _first_format(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poli
 
 
 def _check_policy(policy: Policy) -> None:
-    """Refuse a policy with values that no training could have left."""
+    """Refuse a policy with values that training cannot produce."""
     choose("robot", policy.robot, ROBOTS)
     choose("activation", policy.activation, ACTIVATIONS)
     if not isinstance(policy.observation, Observation):

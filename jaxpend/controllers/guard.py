@@ -57,7 +57,7 @@ class Observer(Pytree):
         return jnp.array(False), jnp.zeros(4), jnp.zeros(2), jnp.zeros(2)
 
     def __call__(self, memory, measured: jax.Array):
-        """New memory and estimated state (4,), given a measurement (4,). The first is believed."""
+        """New memory and estimated state (4,), at first the measured one, of a measurement (4,)."""
         started, x, d, torque = memory
         ahead = rk4_step(self.plant, x, torque, self.dt)
         ahead = ahead + jnp.concatenate([0.5 * self.dt**2 * d, self.dt * d])
@@ -100,7 +100,7 @@ class Rescue(Pytree):
     plant: Plant | None = None  # the model, for the energy
 
     def failed(self, t: jax.Array, x: jax.Array) -> jax.Array:
-        """Whether a state (4,) at time t is one that a swing-up that worked does not reach."""
+        """Whether a swing-up that works would not be in state ``x`` (4,) at time ``t`` (s)."""
         upright = jnp.array(UPRIGHT, x.dtype)
         away = jnp.max(jnp.abs(deviation(x, upright)[:2])) > self.radius
         failed = (t > self.after) & away

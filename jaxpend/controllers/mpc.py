@@ -96,10 +96,10 @@ class MPC(Pytree):
         return plan.replace(z=z, u=u, gain=gain)
 
     def _recover(self, plan: Solution, k, x, x_ref) -> tuple[Solution, jax.Array]:
-        """The plan, and ``x`` on its turn; a plan that lost the state is dropped.
+        """The plan, and ``x`` with angles on the plan's turn; a plan far from ``x`` is dropped.
 
-        Angles are measured modulo a turn or not; the plan knows on which turn it is, and where it
-        is lost, the reference does.
+        Measured angles may be modulo a turn. The plan says on which turn they are, and where it
+        is dropped the reference.
         """
         lost = ~(jnp.max(jnp.abs(deviation(x, plan.z[0, :4])[:2])) < 0.5 * jnp.pi)
         expected = jnp.where(lost, x_ref, plan.z[0, :4])
@@ -169,21 +169,12 @@ def tracking_mpc(
     dtype = reference.x.dtype
     z = jnp.column_stack([reference.x, jnp.concatenate([jnp.zeros(1, dtype), reference.u])])
     gain = jnp.pad(-gain, ((0, 0), (0, 1)))
-    return MPC(
-        plant=plant,
-        x_ref=jnp.concatenate([reference.x[:-1], reference.goal[None]]),
-        u_ref=reference.u,
-        cost_to_go=jnp.concatenate([cost_to_go, top.cost_to_go[None]]),
-        q=jnp.asarray(q, dtype),
-        r=jnp.asarray(r, dtype),
-        smoothness=jnp.asarray(smoothness, dtype),
-        first=_plan(z[: horizon + 1], reference.u[:horizon], gain[:horizon]),
-        joint=active_joint(reference.robot),
-        horizon=horizon,
-        dt=reference.dt,
-        every=every,
-        iterations=iterations,
-    )
+    x_ref = jnp.concatenate([reference.x[:-1], reference.goal[None]])
+    costs = jnp.concatenate([cost_to_go, top.cost_to_go[None]])
+    first = _plan(z[: horizon + 1], reference.u[:horizon], gain[:horizon])
+    timing = {"horizon": horizon, "dt": reference.dt, "every": every, "iterations": iterations}
+    followed = (x_ref, reference.u, costs)
+    return _mpc(plant, reference.robot, followed, (q, r, smoothness), first, **timing)
 
 
 def free_mpc(
@@ -211,23 +202,20 @@ def free_mpc(
     top = lqr(plant, robot, dt=dt)
     dtype = plant.mass.dtype
     zeros = jnp.zeros((horizon + 1, 5), dtype)
-    mpc = MPC(
-        plant=plant,
-        x_ref=top.goal[None],
-        u_ref=jnp.zeros(1, dtype),
-        cost_to_go=top.cost_to_go[None],
-        q=jnp.asarray(q, dtype),
-        r=jnp.asarray(r, dtype),
-        smoothness=jnp.asarray(smoothness, dtype),
-        first=_plan(zeros, zeros[1:, 0], zeros[1:]),
-        joint=active_joint(robot),
-        horizon=horizon,
-        dt=dt,
-        every=every,
-        iterations=iterations,
-    )
+    first = _plan(zeros, zeros[1:, 0], zeros[1:])
+    timing = {"horizon": horizon, "dt": dt, "every": every, "iterations": iterations}
+    upright = (top.goal[None], jnp.zeros(1, dtype), top.cost_to_go[None])
+    mpc = _mpc(plant, robot, upright, (q, r, smoothness), first, **timing)
     key = jax.random.key(0) if key is None else key
     return mpc.replace(first=_first_plan(mpc, key, starts, first_iterations))
+
+
+def _mpc(plant, robot, reference, weights, first, **timing) -> MPC:
+    """Of states, torques and costs-to-go to follow, and weights of state, torque and change."""
+    x_ref, u_ref, costs = reference
+    q, r, smoothness = (jnp.asarray(weight, x_ref.dtype) for weight in weights)
+    joint = active_joint(robot)
+    return MPC(plant, x_ref, u_ref, costs, q, r, smoothness, first, joint, **timing)
 
 
 def _plan(z: jax.Array, u: jax.Array, gain: jax.Array) -> Solution:

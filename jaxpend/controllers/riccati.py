@@ -2,8 +2,9 @@
 
     u_k = u*_k + K_k ((x, u_{k-1}) - (x*_k, u*_{k-1}))
 
-The gains are those of the optimised cost itself, so they correct only as far as the score gains
-by it: the feedback includes the last torque, because a change of torque costs smoothness.
+The gains are those of the optimised cost itself, so they correct a deviation only where that
+improves the score. The feedback includes the last torque, because a change of torque costs
+smoothness.
 """
 
 from typing import ClassVar

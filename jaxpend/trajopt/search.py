@@ -38,7 +38,7 @@ LONG_STAGES = (
 )  # fmt: skip
 FINE_STAGES = ((10.0, 0.02, 0.02), (30.0, 0.01, 0.01), (30.0, 0.005, 0.01), (30.0, 0.003, 0.005))
 SHORT_ITERATIONS, LONG_ITERATIONS, FINE_ITERATIONS = 60, 100, 40
-# Two optima whose objectives differ by less than this are one.
+# Two optima whose objectives differ by less than this are counted as one.
 SAME = 1e-4
 
 
