@@ -1,8 +1,9 @@
 """The analytic gradient of a smooth form of the official score, through the simulator.
 
-The closed loop is differentiated from end to end: what a parameter does to the score seconds
-later is known, not sampled. Adam (Kingma and Ba, 2015) climbs from a trained policy, or from any
-other controller that declares what may be searched (``controllers/search_space.py``),
+The closed loop is differentiated from end to end, so that the effect of a parameter on the score
+seconds later is computed and not estimated from samples. Adam (Kingma and Ba, 2015) climbs from a
+trained policy, or from any other controller that declares what may be searched
+(``controllers/search_space.py``),
 
     (1 - w) smooth v2 score of the nominal run + w mean upright time of random scenarios
 
@@ -12,8 +13,8 @@ over a run and over imperfect scenarios (``variations.sample``, new ones every s
 
 Where motion is chaotic the gradient explodes and says nothing. Therefore the window is
 ``duration`` long, the norm of each run's gradient is clipped before they are averaged, a run
-whose gradient is not finite is left out and counted, and in scenarios what a state does to later
-ones fades from the gradient (``memory``).
+whose gradient is not finite is left out and counted, and in scenarios the effect of a state on
+later states fades from the gradient, with the time constant ``memory``.
 """
 
 import math
@@ -65,8 +66,8 @@ def _fading(memory: float):
 def performance(config: GradientConfig, controller: Controller, task: Task) -> jax.Array:
     """Smooth score of the first ``config.duration`` s of the nominal run."""
     run = rollout(task.plant, controller, jax.random.key(0), dt=task.dt, duration=config.duration)
-    width = jnp.asarray(config.line_width), jnp.asarray(config.power_width)
-    p = SwingUp(task.plant, None, None, *width, task=task, dt=task.dt)
+    line, power = jnp.asarray(config.line_width), jnp.asarray(config.power_width)
+    p = SwingUp(task.plant, None, None, line, power, task, task.dt)
     return smooth_score(p, totals(p, run.x, run.u[:, task.joint]))
 
 
@@ -120,8 +121,8 @@ def slope(config: GradientConfig, start: Controller, task: Task, z: jax.Array, k
 def _adam(config: GradientConfig, weights: np.ndarray) -> optax.GradientTransformation:
     """Adam, warmed up, then with cosine decay; weights and all else have step sizes of their own.
 
-    Adam's first steps are as long as all others, however small the gradient; without a warm-up
-    they lost the swing-up.
+    Adam's first steps are as long as later ones, even where the gradient is small; without a
+    warm-up they destroyed the swing-up.
     """
     rates = np.where(weights, config.learning_rate, config.gain_learning_rate)
     decay = optax.warmup_cosine_decay_schedule(
@@ -132,7 +133,7 @@ def _adam(config: GradientConfig, weights: np.ndarray) -> optax.GradientTransfor
 
 
 def init(config: GradientConfig, controller: Controller, key: jax.Array) -> GradientState:
-    """At the controller, before the first step. Raises as ``search_space.kinds``."""
+    """The state at the controller, before the first step. Raises as ``search_space.kinds``."""
     check_controller(controller)
     z, weights, _ = coordinates(controller, config.searched)
     return GradientState(z, _adam(config, weights).init(z), key, jnp.zeros((), jnp.int32))
@@ -165,7 +166,7 @@ def improve(
 
 
 def current(config: GradientConfig, start: Controller, state: GradientState) -> Controller:
-    """The controller where the ascent is."""
+    """The controller at the parameters that the ascent has reached."""
     return coordinates(start, config.searched)[-1](state.parameters)
 
 

@@ -15,7 +15,7 @@ import jax
 from .boards import HEADINGS, Board
 from .controller import Controller
 from .controllers.catalogue import CATALOGUE, build
-from .controllers.files import load_controller, load_policy
+from .controllers.files import load_controller
 from .errors import JaxpendError, choose
 from .plant import Plant
 from .robustness import CRITERIA, KEYS, benchmark
@@ -76,14 +76,13 @@ def leaderboard(
         say: told what is being judged.
         options: of ``judge``.
     """
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name, (title, make) in controllers.items():
         say(f"judging {title} ...")
-        rows.append(
-            {"name": name, "title": title, "source": "measured"} | judge(make, board, **options)
-        )
-    rows += published(board)
-    return {"robot": board.robot, "rows": sorted(rows, key=lambda row: -row["score"])}
+        row = {"name": name, "title": title, "source": "measured"}
+        rows.append(row | judge(make, board, **options))
+    ranked = sorted([*rows, *published(board)], key=lambda row: -row["score"])
+    return {"robot": board.robot, "rows": ranked}
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:
@@ -92,8 +91,7 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     def shown(value: float | None, form: str) -> str:
         return "" if value is None else format(value, form)
 
-    criteria = row.get("criteria") if row.get("success") else None
-    criteria = criteria or dict.fromkeys(HEADINGS)
+    criteria = (row.get("success") and row.get("criteria")) or dict.fromkeys(HEADINGS)
     six = row.get("robustness_criteria") or dict.fromkeys(CRITERIA)
     title = row["title"] + (" (published)" if row["source"] == "published" else "")
     return [
@@ -105,11 +103,6 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _headings() -> list[str]:
-    criteria = [f"{heading} [{unit}]" for heading, unit, _ in HEADINGS.values()]
-    return ["controller", "score", *criteria, *CRITERIA.values(), "robustness"]
-
-
 def _range(row: Mapping[str, Any]) -> str:
     """Lowest and highest robustness of several keys."""
     by_key = row.get("robustness_by_key") or ()
@@ -118,7 +111,8 @@ def _range(row: Mapping[str, Any]) -> str:
 
 def markdown(board: Mapping[str, Any]) -> str:
     """The board as a Markdown table; of several keys, median and range of the robustness."""
-    headings = _headings()
+    criteria = [f"{heading} [{unit}]" for heading, unit, _ in HEADINGS.values()]
+    headings = ["controller", "score", *criteria, *CRITERIA.values(), "robustness"]
     lines = [headings, ["---"] + ["---:"] * (len(headings) - 1)]
     for row in board["rows"]:
         *others, robustness = cells(row)
@@ -126,33 +120,21 @@ def markdown(board: Mapping[str, Any]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
-def _ships_policy(robot: str) -> bool:
-    try:
-        load_policy(robot)
-    except JaxpendError:
-        return False
-    return True
-
-
 def chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[str, tuple[str, Make]]:
     """Name -> (title, make) of what the command line asks for."""
     if controllers is None:
-        names = [n for n in CATALOGUE if not n.startswith("policy") or _ships_policy(robot)]
+        names = list(CATALOGUE)
     else:
         names = [name.strip() for name in controllers.split(",") if name.strip()]
         if not names:
             raise JaxpendError(f"there is no controller to judge; known: {', '.join(CATALOGUE)}")
-    chosen: dict[str, tuple[str, Make]] = {
-        name: (
-            CATALOGUE[choose("controller", name, CATALOGUE)].title,
-            partial(build, name, robot=robot),
-        )
-        for name in names
-    }
+    chosen: dict[str, tuple[str, Make]] = {}
+    for name in names:
+        title = CATALOGUE[choose("controller", name, CATALOGUE)].title
+        chosen[name] = (title, partial(build, name, robot=robot))
     if policy is not None:
         load_controller(policy, robot=robot)  # a wrong file is known at once
-        own = partial(load_controller, policy, robot=robot)
-        chosen["own_policy"] = (policy.stem, lambda plant: own())
+        chosen["own_policy"] = (policy.stem, lambda plant: load_controller(policy, robot=robot))
     return chosen
 
 

@@ -4,9 +4,9 @@ SNES (Wierstra et al., "Natural evolution strategies", JMLR 2014; evosax) starts
 policy, or from any other controller that declares what may be searched
 (``controllers/search_space.py``). The fitness of an individual is its score in the task (10 s at
 500 Hz on the v2 boards), averaged over rollouts in which a policy's greedy action is un-squashed,
-disturbed by Gaussian noise and squashed again (Calì et al., 2024), so that what is found stands
-on wide ground. All individuals of a generation meet the same noise: common random numbers make
-the comparison fair. Other strategies of evosax stand behind the same options.
+disturbed by Gaussian noise and squashed again (Calì et al., 2024), so that the score of what is
+found does not depend on exact torques. All individuals of a generation meet the same noise: common
+random numbers make the comparison fair. Other strategies of evosax can be chosen by ``strategy``.
 """
 
 import dataclasses
@@ -30,15 +30,9 @@ from .score import imperfect, performance
 from .stage import Chart, SearchStage, SearchState
 
 __all__ = [
-    "SNES",
-    "SNESConfig",
-    "SNESState",
-    "best_controller",
-    "evolve",
-    "fitness",
-    "init",
+    "SNES", "SNESConfig", "SNESState", "best_controller", "evolve", "fitness", "init",
     "mean_controller",
-]
+]  # fmt: skip
 
 STRATEGIES = {name: getattr(algorithms, kind) for name, kind in config.STRATEGIES.items()}
 
@@ -72,23 +66,23 @@ def fitness(
     keys = jax.random.split(key_noise, config.rollouts if draws else 1)
     c = jax.vmap(lambda k: performance(noisy, plant, k, task))(keys)
     score, diverged = task.score(c).mean(), jnp.sum(c.diverged)
-    if not config.scenarios:
-        return score, diverged
-    c = imperfect(controller, task, key_scenarios, config.scenarios)
-    weight = config.scenario_weight
-    score = (1 - weight) * score + weight * task.score(c).mean()
-    return score, diverged + jnp.sum(c.diverged)
+    if config.scenarios:
+        c = imperfect(controller, task, key_scenarios, config.scenarios)
+        weight = config.scenario_weight
+        score = (1 - weight) * score + weight * task.score(c).mean()
+        diverged = diverged + jnp.sum(c.diverged)
+    return score, diverged
 
 
 class _Search:
     """The strategy of a configuration on the coordinates of a controller.
 
     Only SNES takes a standard deviation for each coordinate. The others search in units of it:
-    coordinate = ``unit`` z.
+    coordinate = ``unit`` z, and ``rebuild`` gives the controller at a z.
     """
 
     def __init__(self, config: SNESConfig, controller: Controller):
-        flat, weights, self._rebuild = coordinates(controller, config.searched)
+        flat, weights, rebuild = coordinates(controller, config.searched)
         std = jnp.where(weights, config.sigma, config.gain_sigma).astype(flat.dtype)
 
         def shrunk(generation):
@@ -100,7 +94,7 @@ class _Search:
         self.decay = 1.0 if options else config.final_sigma ** (1.0 / config.generations)
         per_coordinate = config.strategy == "snes"
         self.unit = jnp.ones((), flat.dtype) if per_coordinate else std
-        self.start = flat / self.unit
+        self.start, self.rebuild = flat / self.unit, lambda z: rebuild(self.unit * z)
         kind = STRATEGIES[config.strategy]
         self.strategy = kind(population_size=config.population, solution=flat, **options)
         with jax.ensure_compile_time_eval():  # LM-MA-ES turns a number of vectors into an int
@@ -108,10 +102,6 @@ class _Search:
         if hasattr(self.params, "std_init"):
             first = std if per_coordinate else jnp.ones((), flat.dtype)
             self.params = self.params.replace(std_init=first)
-
-    def rebuild(self, z: jax.Array) -> Controller:
-        """The controller at ``z``."""
-        return self._rebuild(self.unit * z)
 
 
 def init(config: SNESConfig, controller: Controller, key: jax.Array) -> SNESState:
@@ -124,7 +114,8 @@ def init(config: SNESConfig, controller: Controller, key: jax.Array) -> SNESStat
     key, key_init = jax.random.split(key)
     state = search.strategy.init(key_init, search.start, search.params)
     state = SNESState(state, key, search.start, jnp.asarray(-jnp.inf), jnp.zeros((), jnp.int32))
-    # Weak types would be strong after the first chunk, and ``evolve`` compiled a second time.
+    # jax would change weak types after the first chunk and compile ``evolve`` again, so all types
+    # are made strong here.
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf)), state)
 
 
@@ -148,9 +139,8 @@ def evolve(
     def generation(state, _):
         key, key_ask, key_noise, key_tell = jax.random.split(state.key, 4)
         population, inner = strategy.ask(key_ask, state.strategy, params)
-        scores, diverged = jax.vmap(lambda p: fitness(config, search.rebuild(p), key_noise, task))(
-            population
-        )
+        judged = jax.vmap(lambda p: fitness(config, search.rebuild(p), key_noise, task))
+        scores, diverged = judged(population)
         if config.strategy == "lm_ma_es":  # evosax weighs what it remembers by place, not by rank
             order = jnp.argsort(-scores)
             population, scores = population[order], scores[order]
