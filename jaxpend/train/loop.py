@@ -94,9 +94,7 @@ def stages_of(
 
 
 def train(
-    config: Run,
-    command: str = "jaxpend.train.train",
-    kinds: Sequence[type[Stage]] = STAGES,
+    config: Run, command: str = "jaxpend.train.train", kinds: Sequence[type[Stage]] = STAGES
 ) -> dict[str, Any]:
     """The stages that the configuration has, in its run folder: begun, or taken up again.
 
