@@ -29,13 +29,13 @@ import optax
 from .boards import Task, own_task
 from .config import GradientConfig, Run
 from .controller import Controller, check_controller
-from .controllers.search_space import coordinates, kinds
+from .controllers.search_space import coordinates
 from .criteria import EPSILON
 from .plant import rk4_step
 from .pytree import Pytree, pytree
 from .rollout import rollout
 from .scenario import Scenario
-from .stage import Chart, SearchStage, SearchState
+from .stage import Candidates, Chart, Row, SearchStage, SearchState
 from .trajopt.swingup import SwingUp, smooth_score, totals
 from .variations import LONGEST_DELAY
 
@@ -181,49 +181,28 @@ class Gradient(SearchStage):
         Chart("Norm of the gradient", {"norm": "slope"}, log=True),
     )
 
-    def __init__(self, config: GradientConfig, policy: Controller, task: Task):
-        """``policy`` is a controller of the structure that the ascent starts from.
-
-        Raises ``JaxpendError`` if it has nothing to search.
-        """
-        kinds(policy, config.searched)
-        self.config, self.total = config, config.steps
-        self.policy, self.task = policy, task
-
     @classmethod
     def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
         config = getattr(run, "gradient", None)
-        if not (config and config.steps):
-            return None
-        assert start is not None  # a run of this stage alone names one
-        return cls(config, start, task)
+        return cls(config, start, task) if config and config.steps else None
 
-    def start(self, seed: int, before: Controller) -> SearchState:
+    def begin(self, seed: int, controller: Controller) -> SearchState:
         key = jax.random.fold_in(jax.random.key(seed), 2)
-        return SearchState(before, init(self.config, before, key), jnp.asarray(0))
+        return SearchState(controller, init(self.config, controller, key), jnp.asarray(0))
 
-    def like(self) -> SearchState:
-        return jax.eval_shape(lambda policy: self.start(0, policy), self.policy)
+    def search(self, states: list[SearchState], count: int) -> list[tuple[GradientState, Row]]:
+        return [improve(self.config, s.start, s.search, count, self.task) for s in states]
 
-    def advance(self, states: list[SearchState]) -> list[tuple[SearchState, dict[str, Any]]]:
-        count, after = self.chunk(states[0]), []
-        for state in states:
-            search, metrics = improve(self.config, state.start, state.search, count, self.task)
-            after.append((self.moved(state, search, count), metrics))
-        return after
-
-    def judge(
-        self, state: SearchState, metrics: dict[str, Any]
-    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
+    def judge(self, state: SearchState, metrics: Row) -> tuple[Row, Candidates]:
         policy = current(self.config, state.start, state.search)
         score, worth = self.compared(policy)
         row = {"score": score, "value": worth, "lost": int(state.search.lost)}
         return row | {name: values[-1] for name, values in metrics.items()}, [(policy, worth)]
 
-    def note(self, row: dict[str, Any]) -> str:
+    def note(self, row: Row) -> str:
         return f"smooth score {float(row['smooth_score']):.4f}  score {row['score']:.4f}"
 
-    def watched(self, state: SearchState) -> Any:
+    def watched(self, state: SearchState) -> jax.Array:
         return state.search.parameters
 
 

@@ -24,10 +24,10 @@ from .config import GuardConfig, Run, SNESConfig
 from .controller import Controller, check_controller
 from .controllers.guard import guard
 from .controllers.policy import change_policies
-from .controllers.search_space import coordinates, kinds
+from .controllers.search_space import coordinates
 from .pytree import Pytree, pytree
 from .score import imperfect, performance
-from .stage import Chart, SearchStage, SearchState
+from .stage import Candidates, Chart, Row, SearchStage, SearchState
 
 __all__ = [
     "SNES", "SNESConfig", "SNESState", "best_controller", "evolve", "fitness", "init",
@@ -191,66 +191,37 @@ class SNES(SearchStage):
     def __init__(
         self, config: SNESConfig, policy: Any, task: Task, guarding: GuardConfig | None = None
     ):
-        """``policy`` is a controller of the structure that the search starts from, before a guard.
-
-        Raises ``JaxpendError`` if it has nothing to search.
-        """
-        self.config, self.total, self.task = config, config.generations, task
-        self.guarding = guarding or GuardConfig()
+        """``policy`` is a controller of the structure that the search starts from, unguarded."""
+        self.guarding, self.task = dataclasses.asdict(guarding or GuardConfig()), task
         shapes = jax.eval_shape(lambda p: p, policy)
-        self.policy = self.guarded(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes))
-        kinds(self.policy, config.searched)
+        zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+        super().__init__(config, self.prepared(zeros), task)
         self.fresh_fitness = jax.jit(lambda p, key: fitness(config, p, key, task)[0])
-
-        def evolve_all(policies, searches, count):
-            def one(policy, search):
-                return evolve(config, policy, search, count, task)
-
-            return jax.vmap(one)(policies, searches)
-
-        self.evolve_all = jax.jit(evolve_all, static_argnames="count")
 
     @classmethod
     def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
         config = getattr(run, "snes", None)
         return cls(config, start, task, getattr(run, "guard", None)) if config else None
 
-    def guarded(self, controller: Controller) -> Controller:
-        """The controller that is searched."""
-        options = dataclasses.asdict(self.guarding)
-        return guard(controller, self.task.robot, self.task.plant, **options)
+    def prepared(self, controller: Controller) -> Controller:
+        return guard(controller, self.task.robot, self.task.plant, **self.guarding)
 
-    def start(self, seed: int, before: Controller) -> SearchState:
-        return self._begin(self.guarded(before), *self._keys(seed))
+    def begin(self, seed: int, controller: Controller) -> SearchState:
+        key, fresh = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
+        return SearchState(controller, init(self.config, controller, key), jnp.asarray(0), fresh)
 
-    def _keys(self, seed):
-        return jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
+    def search(self, states: list[SearchState], count: int) -> list[tuple[SNESState, Row]]:
+        def chunk(start, search):
+            return evolve(self.config, start, search, count, self.task)
 
-    def _begin(self, start, key_init, key_fresh):
-        search = init(self.config, start, key_init)
-        return SearchState(start, search, jnp.asarray(0), key_fresh)
-
-    def like(self) -> SearchState:
-        return jax.eval_shape(self._begin, self.policy, *self._keys(0))
-
-    def advance(self, states: list[SearchState]) -> list[tuple[SearchState, dict[str, Any]]]:
-        count = self.chunk(states[0])
         both = [(state.start, state.search) for state in states]
         if len(states) == 1:
-            after = [evolve(self.config, *both[0], count, self.task)]
-        else:
-            stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *both)
-            found = self.evolve_all(*stacked, count)
-            after = [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(states))]
-        return [
-            (self.moved(state, search, count), metrics)
-            for state, (search, metrics) in zip(states, after, strict=True)
-        ]
+            return [chunk(*both[0])]
+        found = jax.vmap(chunk)(*jax.tree.map(lambda *leaves: jnp.stack(leaves), *both))
+        return [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(states))]
 
-    def judge(
-        self, state: SearchState, metrics: dict[str, Any]
-    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
-        row: dict[str, Any] = {"diverged": int(state.search.diverged)}
+    def judge(self, state: SearchState, metrics: Row) -> tuple[Row, Candidates]:
+        row: Row = {"diverged": int(state.search.diverged)}
         row |= {name: values[-1] for name, values in metrics.items()}
         assert state.fresh is not None
         key, candidates = jax.random.fold_in(state.fresh, self.done(state)), []
@@ -262,10 +233,10 @@ class SNES(SearchStage):
             candidates.append((policy, worth))
         return row, candidates
 
-    def note(self, row: dict[str, Any]) -> str:
+    def note(self, row: Row) -> str:
         return f"fitness {float(row['mean_fitness']):.3f}  mean {row['mean_score']:.4f}"
 
-    def watched(self, state: SearchState) -> Any:
+    def watched(self, state: SearchState) -> tuple[jax.Array, jax.Array]:
         return state.search.strategy.mean, state.search.strategy.std
 
 

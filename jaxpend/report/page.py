@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 
 from .. import __version__, boards
 from ..boards import CRITERIA, Board
+from ..config_files import flat
 from ..files import write_atomically
 from ..robustness import KEYS
 from ..runs.reader import RunRecord, StageRecord, remarks
@@ -141,14 +142,6 @@ def _ranking(board: Board, own: Sequence[tuple[str, float, float | None]]) -> li
     return [dict(zip(names, row, strict=True)) for row in sorted(rows, key=lambda r: -r[1])]
 
 
-def _flat(config: Mapping, prefix: str = "") -> dict[str, Any]:
-    flat = {}
-    for name, value in config.items():
-        deeper = isinstance(value, Mapping)
-        flat |= _flat(value, f"{prefix}{name}.") if deeper else {prefix + name: value}
-    return flat
-
-
 def _seed_table(runs: Sequence[RunRecord], judged: Sequence[Judged | None]) -> list[dict]:
     """A row for every seed."""
     rows = []
@@ -269,7 +262,7 @@ def _about(runs: Sequence[RunRecord], rows: list[dict], board: Board, title: str
         "seeds": rows if len(runs) > 1 else [],
         "stages": runs[0].results if len(runs) == 1 else {},
         "config": [{"name": n, "value": v, "default": d} for n, (v, d) in changed.items()],
-        "whole_config": _flat(runs[0].config),
+        "whole_config": flat(runs[0].config),
         "versions": {"jaxpend": __version__, "jax": jax.__version__, "numpy": np.__version__},
     }
 
