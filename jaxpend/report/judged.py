@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..boards import HEADINGS, Board
+from ..boards import HEADINGS, Board, Task
 from ..controllers.files import load_controller, read_header
 from ..plant import forward_kinematics
 from ..robustness import KEYS, benchmark
@@ -19,8 +19,9 @@ __all__ = ["Judged", "criteria_costs", "judge"]
 
 @dataclasses.dataclass(frozen=True)
 class Judged:
-    """A policy on the task of a board, in float64, and in the robustness benchmark."""
+    """A policy on a task, in float64, and in the robustness benchmark."""
 
+    task: Task
     score: float
     criteria: dict[str, float]
     success: bool
@@ -40,6 +41,11 @@ class Judged:
     def robustness(self) -> float | None:
         """Overall robustness, the median over keys; None where it was not measured."""
         return self.report["overall"] if self.report else None
+
+    @property
+    def reach(self) -> float:
+        """What the end effector reaches when it is stretched, m."""
+        return float(self.task.plant.length.sum())
 
     @property
     def whole(self) -> float:
@@ -66,12 +72,11 @@ def judge(run: RunRecord, board: Board, keys: int = KEYS) -> Judged | None:
     """
     if run.policy is None:
         return None
-    task = board.task
+    task, report = board.task, None
     with jax.enable_x64(True):
         trajectory, c = nominal_run(load_controller(run.policy, robot=run.robot), task)
         score = float(task.score(c))
         points = jax.vmap(forward_kinematics, (None, 0))(task.plant, trajectory.x)
-    report = None
     if keys:
         policy = load_controller(run.policy, robot=run.robot)
         found = benchmark(policy, board, jax.random.key(0), keys=keys)
@@ -79,6 +84,7 @@ def judge(run: RunRecord, board: Board, keys: int = KEYS) -> Judged | None:
     x = np.asarray(trajectory.x)
     samples = np.isfinite(x).all(axis=1).cumprod().sum()  # the first one is the start
     return Judged(
+        task=task,
         score=score,
         criteria={name: float(value) for name, value in vars(c).items() if name != "success"},
         success=bool(c.success),
@@ -91,15 +97,14 @@ def judge(run: RunRecord, board: Board, keys: int = KEYS) -> Judged | None:
     )
 
 
-def criteria_costs(judged: Judged, board: Board) -> list[dict[str, Any]]:
-    """The criteria of a board's score, and what each costs of it; none for another score."""
-    norms = dict(getattr(board.task.scoring, "norms", ()))
+def criteria_costs(judged: Judged) -> list[tuple[str, str, float]]:
+    """Every criterion of the score: heading, value with unit, cost; none for another score."""
+    norms = dict(getattr(judged.task.scoring, "norms", ()))
     rows = []
     for name, norm in norms.items():
-        title, unit, form = HEADINGS[name]
+        heading, unit, form = HEADINGS[name]
         value = judged.criteria[name]
         share = math.tanh(math.pi * value / norm)
         share = share if math.isfinite(share) else 1.0
-        text = f"{value:{form}}"
-        rows.append({"title": title, "value": text, "unit": unit, "cost": share / len(norms)})
+        rows.append((heading, f"{value:{form}} {unit}", share / len(norms)))
     return rows
