@@ -11,7 +11,6 @@ import json
 import re
 import warnings
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,13 +57,13 @@ STYLE: Any = {
 styled = matplotlib.rc_context(STYLE)
 
 
-def save(figure: Figure, path: Path, dpi: int = 150) -> None:
+def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, atomically."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         # A name may have characters that the font does not have; boxes stand for them.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
-        figure.savefig(buffer, format="png", dpi=dpi)
+        figure.savefig(buffer, format="png", dpi=150)
     write_atomically(path, buffer.getvalue())
 
 
@@ -106,7 +105,7 @@ def stack(
 
 def panel(draw: Callable[..., Any], *data: Any, **options: Any) -> Figure:
     """``draw(axes, *data, **options)`` alone on a figure."""
-    return stack([partial(draw, *data, **options)])
+    return stack([lambda axes: draw(axes, *data, **options)])
 
 
 # --- robustness ----------------------------------------------------------------------------

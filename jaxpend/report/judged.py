@@ -10,7 +10,7 @@ import numpy as np
 from ..boards import HEADINGS, Board, Task
 from ..controllers.files import load_controller, read_header
 from ..plant import forward_kinematics
-from ..robustness import KEYS, benchmark
+from ..robustness import benchmark
 from ..runs.reader import RunRecord
 from ..score import nominal_run
 
@@ -60,7 +60,7 @@ class Judged:
         return min(self.whole, max(3.0, float(round(2.5 * self.up))))
 
 
-def judge(run: RunRecord, board: Board, keys: int = KEYS) -> Judged | None:
+def judge(run: RunRecord, board: Board, robustness: bool = True) -> Judged | None:
     """The official run of a run's best policy so far, its score, and its robustness.
 
     The policies of several seeds share one compilation.
@@ -68,7 +68,7 @@ def judge(run: RunRecord, board: Board, keys: int = KEYS) -> Judged | None:
     Args:
         run: its policy is judged; the result is None where there is none yet.
         board: whose task it is judged on.
-        keys: of the robustness benchmark; 0 leaves it out.
+        robustness: run the benchmark too.
     """
     if run.policy is None:
         return None
@@ -77,9 +77,9 @@ def judge(run: RunRecord, board: Board, keys: int = KEYS) -> Judged | None:
         trajectory, c = nominal_run(load_controller(run.policy, robot=run.robot), task)
         score = float(task.score(c))
         points = jax.vmap(forward_kinematics, (None, 0))(task.plant, trajectory.x)
-    if keys:
+    if robustness:
         policy = load_controller(run.policy, robot=run.robot)
-        found = benchmark(policy, board, jax.random.key(0), keys=keys)
+        found = benchmark(policy, board, jax.random.key(0))
         report = {"robot": run.robot} | found.as_dict()
     x = np.asarray(trajectory.x)
     samples = np.isfinite(x).all(axis=1).cumprod().sum()  # the first one is the start

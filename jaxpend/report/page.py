@@ -14,7 +14,6 @@ import numpy as np
 from .. import __version__, boards
 from ..boards import CRITERIA, Board
 from ..files import write_atomically
-from ..robustness import KEYS
 from ..runs.reader import RunRecord, StageRecord, remarks
 from ..runs.statistics import interquartile_mean, interval
 from . import figures
@@ -153,7 +152,6 @@ def write(
     *,
     title: str,
     robustness: bool = True,
-    keys: int = KEYS,
     board: Board | None = None,
 ) -> Path:
     """Judge what the runs have left, and write ``report.html`` and the pictures of ``report/``.
@@ -162,8 +160,7 @@ def write(
         runs: one run, or the seeds of one configuration.
         folder: to write into.
         title: name of the run, or of the folder of seeds.
-        robustness: run the benchmark for every seed.
-        keys: of the benchmark; what is reported is the median over them.
+        robustness: run the benchmark for every seed; what is reported is the median over keys.
         board: to judge on; by default the v2 board of the runs' robot.
 
     Returns:
@@ -172,7 +169,7 @@ def write(
     pictures, title = folder / "report", _legible(title)
     runs = [dataclasses.replace(run, name=_legible(run.name)) for run in runs]
     board = _board(runs[0]) if board is None else board
-    judged = [judge(run, board, keys if robustness else 0) for run in runs]
+    judged = [judge(run, board, robustness) for run in runs]
     known = [(run, found) for run, found in zip(runs, judged, strict=True) if found]
     context = _about(runs, judged, board, title)
     learning = list(_learning(runs))

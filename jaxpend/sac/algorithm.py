@@ -18,7 +18,7 @@ from ..controllers.policy import Policy
 from ..env import Env, EnvState
 from ..pytree import Pytree, pytree
 from . import losses, replay
-from .critics import Critic, TwinCritic
+from .critics import TwinCritic
 from .demonstrations import Imitation, imitate, imitation, swingups
 from .networks import Actor, Params, act, constant_log_std, to_policy
 from .replay import Replay, Transition
@@ -59,7 +59,7 @@ class Agent:
         return Actor(self.config.actor_hidden, self.config.activation)
 
     @cached_property
-    def critic(self) -> Critic:
+    def critic(self) -> TwinCritic:
         """What judges actions."""
         config = self.config
         return TwinCritic(config.critic_hidden, config.activation, config.critic_layer_norm)
@@ -68,11 +68,9 @@ class Agent:
     def optimizer(self) -> optax.GradientTransformation:
         """Adam with cosine decay over the whole run."""
         config = self.config
-        total = config.steps // config.num_envs * config.updates_per_step
-        schedule = optax.cosine_decay_schedule(
-            config.learning_rate, max(total, 1), alpha=config.final_learning_rate
-        )
-        return optax.adam(schedule)
+        total = max(config.steps // config.num_envs * config.updates_per_step, 1)
+        rate, last = config.learning_rate, config.final_learning_rate
+        return optax.adam(optax.cosine_decay_schedule(rate, total, alpha=last))
 
 
 @pytree
