@@ -76,7 +76,7 @@ def leaderboard(
         say: told what is being judged.
         options: of ``judge``.
     """
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name, (title, make) in controllers.items():
         say(f"judging {title} ...")
         row = {"name": name, "title": title, "source": "measured"}

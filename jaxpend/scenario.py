@@ -4,6 +4,8 @@ An imperfection that is ``None`` is left out of the compiled program, so the nom
 costs nothing; one that is an array may differ per rollout under ``jax.vmap``.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -69,52 +71,30 @@ def delay_steps(delay: float, dt: float = DT, mode: str = "posvel") -> np.ndarra
     return int(delay / dt) * np.array(lagging[choose("delay mode", mode, lagging)])
 
 
-def random_pulses(
-    key: jax.Array,
-    *,
-    duration: float = DURATION,
-    per_joint: int = 3,
-    distance: float = 1.0,
-    width: tuple[float, float] = (0.05, 0.1),
-    amplitude: tuple[float, float] = (0.5, 5.0),
-) -> Pulses:
-    """Random disturbance pulses, distributed as in the RealAIGym robustness benchmark.
+# Random pulses of the benchmark: (joints, pulses on each), the least distance in s between any
+# two centres and from the start, ranges of the standard deviation in s and the amplitude in N m.
+PULSES, DISTANCE, WIDTH, AMPLITUDE = (2, 3), 1.0, (0.05, 0.1), (0.5, 5.0)
 
-    Args:
-        key: consumed.
-        duration: s, of the run.
-        per_joint: pulses on each joint.
-        distance: s, the least one between any two centres, and from the start.
-        width: s, range of the (uniform) standard deviations.
-        amplitude: N m, range of the (uniform) amplitudes; the sign is a coin's.
 
-    Raises:
-        JaxpendError: more pulses than fit into the duration.
+def random_pulses(key: jax.Array, *, duration: float = DURATION) -> Pulses:
+    """Three pulses on each joint, as random as in the RealAIGym robustness benchmark.
+
+    ``key`` is consumed, ``duration`` (s) is that of the run. Raises ``JaxpendError`` if the pulses
+    do not fit into it.
     """
-    n = 2 * per_joint
-    slack = (duration - (n + 1) * distance) / n
+    n = math.prod(PULSES)
+    slack = (duration - (n + 1) * DISTANCE) / n
     if slack < 0:
-        raise JaxpendError(f"{n} pulses {distance} s apart do not fit into {duration} s")
+        raise JaxpendError(f"{n} pulses {DISTANCE} s apart do not fit into {duration} s")
     wait_key, joint_key, width_key, amplitude_key = jax.random.split(key, 4)
-    centres = jnp.cumsum(distance + slack * jax.random.uniform(wait_key, (n,)))
-    shape = (2, per_joint)
-    span = amplitude[1] - amplitude[0]
-    offset = jax.random.uniform(amplitude_key, shape, minval=-span, maxval=span)
+    centres = jnp.cumsum(DISTANCE + slack * jax.random.uniform(wait_key, (n,)))
+    span = AMPLITUDE[1] - AMPLITUDE[0]
+    offset = jax.random.uniform(amplitude_key, PULSES, minval=-span, maxval=span)
     return Pulses(
-        time=jax.random.permutation(joint_key, centres).reshape(shape),
-        width=jax.random.uniform(width_key, shape, minval=width[0], maxval=width[1]),
-        amplitude=offset + amplitude[0] * jnp.sign(offset),
+        time=jax.random.permutation(joint_key, centres).reshape(PULSES),
+        width=jax.random.uniform(width_key, PULSES, minval=WIDTH[0], maxval=WIDTH[1]),
+        amplitude=offset + AMPLITUDE[0] * jnp.sign(offset),
     )
-
-
-def _scales(scenario: Scenario):
-    """Names of what must not be negative, and the values."""
-    for name in ("measurement_noise", "delay", "process_noise", "torque_noise", "responsiveness"):
-        if getattr(scenario, name) is not None:
-            yield name, getattr(scenario, name)
-    yield "torque_limit", scenario.plant.torque_limit
-    if scenario.pulses is not None:
-        yield "pulse width", scenario.pulses.width
 
 
 def check_values(scenario: Scenario) -> None:
@@ -124,11 +104,14 @@ def check_values(scenario: Scenario) -> None:
         JaxpendError: a negative noise, delay, responsiveness, width or torque limit, or a value
             that is not finite (torque limits may be infinite).
     """
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(scenario))
-    if traced:
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(scenario)):
         return
-    for name, value in _scales(scenario):
-        if np.any(np.asarray(value) < 0):
+    names = ("measurement_noise", "delay", "process_noise", "torque_noise", "responsiveness")
+    scales = {name: getattr(scenario, name) for name in names}
+    scales["torque_limit"] = scenario.plant.torque_limit
+    scales["pulse width"] = None if scenario.pulses is None else scenario.pulses.width
+    for name, value in scales.items():
+        if value is not None and np.any(np.asarray(value) < 0):
             raise JaxpendError(f"{name} is {np.min(value)}; it must not be negative")
     for path, value in jax.tree_util.tree_leaves_with_path(scenario):
         name = jax.tree_util.keystr(path, simple=True, separator=" ")

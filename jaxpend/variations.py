@@ -19,9 +19,11 @@ import numpy as np
 
 from .errors import JaxpendError, choose
 from .plant import Plant
-from .scenario import DT, Pulses, Scenario, delay_steps, random_pulses
+from .scenario import DT, Scenario, delay_steps, random_pulses
 
-__all__ = ["INERTIAL", "LONGEST_DELAY", "RANGES", "VARIATIONS", "Variation", "sample", "vary"]
+__all__ = [
+    "INERTIAL", "LONGEST_DELAY", "RANGES", "VARIATIONS", "Variation", "numbers", "sample", "vary",
+]  # fmt: skip
 
 # (batch of n scenarios in numpy arrays, n values, n keys) -> batch of scenarios
 Apply = Callable[[Scenario, np.ndarray, jax.Array], Scenario]
@@ -37,27 +39,6 @@ class Variation:
     least: float = -np.inf  # values below make no sense
     in_steps: bool = False  # seconds that the reference cuts off to whole steps
     draws: bool = False  # whether a run of it depends on a key
-
-    def numbers(self, name: str, values: Any) -> np.ndarray:
-        """The values (n,) in SI units. Raises ``JaxpendError`` for what makes no sense."""
-        try:
-            values = np.atleast_1d(np.asarray(values, float))
-        except (TypeError, ValueError):
-            raise JaxpendError(f"{name} is {values!r}; it must be numbers") from None
-        if values.ndim != 1 or not values.size:
-            shape = values.shape
-            raise JaxpendError(f"{name} has values of shape {shape}; give a list of some numbers")
-        for value in values[~(np.isfinite(values) & (values >= self.least))]:
-            rule = "finite" if not np.isfinite(value) else f"at least {self.least:g}"
-            raise JaxpendError(f"{name} is {value} {self.unit}; it must be {rule}".rstrip())
-        return values
-
-    def checked(self, name: str, values: Any, dt: float) -> np.ndarray:
-        """The values (n,) as ``apply`` takes them. Raises as ``numbers``."""
-        values = self.numbers(name, values)
-        if self.in_steps:
-            return np.array([delay_steps(value, dt)[0] for value in values])
-        return values
 
 
 def _plant(field: str, index: int | None = None, per: tuple[str, int] | None = None) -> Apply:
@@ -114,14 +95,13 @@ _many_pulses = jax.jit(jax.vmap(random_pulses))
 
 def _perturbation(scenario, values, keys):
     """A random series of pulses for each key, its amplitudes times the value."""
-    pulses = _many_pulses(keys)
-    pulses = jax.tree.map(lambda a: np.asarray(a, scenario.dtype), pulses)
+    pulses = jax.tree.map(lambda a: np.asarray(a, scenario.dtype), _many_pulses(keys))
     scale = values[:, None, None].astype(scenario.dtype)
     return scenario.replace(pulses=pulses.replace(amplitude=pulses.amplitude * scale))
 
 
-# How bad it gets on the v2 boards: the ends of every grid of the robustness benchmark. Those of
-# inertial parameters are factors of the nominal value.
+# The ends of the grids of the v2 boards' robustness benchmark. Those of inertial parameters are
+# factors of the nominal value.
 INERTIAL = (0.75, 1.25)
 RANGES: dict[str, tuple[float, float]] = {
     "Ir": (0.0, 1e-4),
@@ -168,6 +148,22 @@ VARIATIONS: dict[str, Variation] = {
 }
 
 
+def numbers(name: str, values: Any) -> np.ndarray:
+    """Values (n,) of the variation ``name``. Raises ``JaxpendError`` for what makes no sense."""
+    kind = VARIATIONS[choose("variation", name, VARIATIONS)]
+    try:
+        values = np.atleast_1d(np.asarray(values, float))
+    except (TypeError, ValueError):
+        raise JaxpendError(f"{name} is {values!r}; it must be numbers") from None
+    if values.ndim != 1 or not values.size:
+        shape = values.shape
+        raise JaxpendError(f"{name} has values of shape {shape}; give a list of some numbers")
+    for value in values[~(np.isfinite(values) & (values >= kind.least))]:
+        rule = f"at least {kind.least:g}" if np.isfinite(value) else "finite"
+        raise JaxpendError(f"{name} is {value} {kind.unit}; it must be {rule}".rstrip())
+    return values
+
+
 def vary(
     scenario: Scenario, changes: Mapping[str, Any], *, key: jax.Array, dt: float = DT
 ) -> Scenario:
@@ -184,10 +180,7 @@ def vary(
     Raises:
         JaxpendError: an unknown name, values of different number, out of range or not finite.
     """
-    values = {
-        name: VARIATIONS[choose("variation", name, VARIATIONS)].checked(name, given, dt)
-        for name, given in changes.items()
-    }
+    values = {name: numbers(name, given) for name, given in changes.items()}
     sizes = {len(v) for v in values.values()}
     if not sizes:
         raise JaxpendError("there are no changes; give at least one imperfection and its values")
@@ -198,16 +191,14 @@ def vary(
     keys = jax.random.split(key, (n, len(values)))
     batch = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (n, *np.shape(leaf))), scenario)
     for number, (name, its_values) in enumerate(values.items()):
+        if VARIATIONS[name].in_steps:
+            its_values = np.array([delay_steps(value, dt)[0] for value in its_values])
         batch = VARIATIONS[name].apply(batch, its_values, keys[:, number])
     return batch
 
 
-# --- at random ------------------------------------------------------------------------------
-
-
 def _vary_plant(plant: Plant, which: jax.Array, amount: jax.Array) -> Plant:
     """The plant with parameter ``which`` of ten (none if negative) off by ``amount`` in [-1, 1]."""
-
     (_, motor_inertia), (_, damping), (_, friction) = (RANGES[n] for n in ("Ir", "b1", "cf1"))
     spread = INERTIAL[1] - 1
     coulomb = plant.coulomb_friction
@@ -216,9 +207,9 @@ def _vary_plant(plant: Plant, which: jax.Array, amount: jax.Array) -> Plant:
     def off(number, joint):
         return jnp.where(which == number, amount, 0.0) * (np.arange(2) == joint)
 
+    heavier_motor = jnp.where(which == 0, motor_inertia * (amount + 1) / 2, 0.0)
     return plant.replace(
-        motor_inertia=plant.motor_inertia
-        + jnp.where(which == 0, motor_inertia * (amount + 1) / 2, 0.0),
+        motor_inertia=plant.motor_inertia + heavier_motor,
         com=plant.com * (1 + spread * (off(1, 0) + off(5, 1))),
         inertia=plant.inertia * (1 + spread * (off(2, 0) + off(7, 1))),
         damping=plant.damping + damping * (off(3, 0) + off(8, 1)),
@@ -241,7 +232,7 @@ def sample(plant: Plant, key: jax.Array, share: float = 1.0) -> Scenario:
     amount = jax.random.uniform(key_amount, minval=-1.0, maxval=1.0)
     part = (amount + 1) / 2  # the same draw on [0, 1]
     slow, fast = RANGES["responsiveness"]
-    pulses: Pulses = random_pulses(key_pulses)
+    pulses = random_pulses(key_pulses)
     delay = jnp.where(kind == 4, jnp.round(part * LONGEST_DELAY), 0).astype(jnp.int32)
     noise = jnp.where(kind == 1, RANGES["velocity_noise"][1] * part, 0.0)
     torque_noise = jnp.where(kind == 2, RANGES["torque_noise"][1] * part, 0.0)

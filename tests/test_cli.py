@@ -87,6 +87,9 @@ def run(monkeypatch, capsys, arguments, function=main):
         ("--plot there", "there pendubot 3 True fast None\n"),
         ("--pair None --keys 1 --keys 2", "here pendubot 2 True fast None\n"),
         ("-", "- pendubot 3 True fast None\n"),
+        ("--no-plot there", "there pendubot 3 False fast None\n"),
+        ("--keys 1 -- --with_this", "--with_this pendubot 1 True fast None\n"),
+        ("--robot=pendubot --pair -1e3 -inf", "here pendubot 3 True fast ('-1e3', '-inf')\n"),
     ],
 )
 def test_run_parses_calls_and_exits(monkeypatch, capsys, arguments, out):
@@ -120,6 +123,8 @@ def test_run_parses_calls_and_exits(monkeypatch, capsys, arguments, out):
         ("--kind quick", "--kind is 'quick'; it must be fast or slow"),
         ("--pair a", "--pair is 'a'; it must be 2 values, each a text"),
         ("--no-plot=yes", "--no-plot takes no value; --plot does"),
+        ("--plot=there", "--plot is 'there'; it must be yes or no"),
+        ("--plot there here", "unexpected argument 'here'; see prog --help"),
         ("--no-plat", "unknown option --no-plat; did you mean --no-plot?"),
         ("--robo acrobot", "unknown option --robo; did you mean --robot?"),
     ],
@@ -475,7 +480,7 @@ def test_help_shows_choices_and_with_capital_h_what_fields_mean():
         assert "--sac.mirror, --sac.no-mirror (default: no)" in text
     about = ("gradient updates per vector step", "Polyak averaging of the target critics")
     assert all(words in full and words not in short for words in about)
-    assert "\n\nsac.env: The learning environment.\n" in short
+    assert "\n\nsac.env: The learning environment:\n" in short
 
 
 # --- what the commands refuse before they compute ------------------------------------------

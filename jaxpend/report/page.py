@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 
 from .. import __version__, boards
 from ..boards import CRITERIA, Board
+from ..config_files import flat
 from ..files import write_atomically
 from ..runs.reader import RunRecord, StageRecord, remarks
 from ..runs.statistics import interquartile_mean, interval
@@ -105,14 +106,6 @@ def _draw(judged: Judged, title: str, folder: Path) -> dict[str, list[str]]:
 
 
 # --- tables ----------------------------------------------------------------------------------
-
-
-def _flat(config: Mapping, prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in config.items():
-        deeper = isinstance(value, Mapping)
-        flat |= _flat(value, f"{prefix}{name}.") if deeper else {prefix + name: value}
-    return flat
 
 
 def _summary(values: Sequence[float | None]) -> dict[str, Any]:
@@ -210,7 +203,7 @@ def _about(
         "stages": runs[0].results if len(runs) == 1 else {},
         "made_by": runs[0].made_by,
         "changed": runs[0].made_by.get("changed", {}),
-        "whole_config": _flat(runs[0].config),
+        "whole_config": flat(runs[0].config),
         "versions": {"jaxpend": __version__, "jax": jax.__version__, "numpy": np.__version__},
     }
 
