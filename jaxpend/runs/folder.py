@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .. import __version__
-from . import tensorboard
 from ..config_files import differing_field, to_mapping
 from ..errors import JaxpendError
 from ..files import TEMPORARY, remove_temporary, to_json, write_atomically
+from . import tensorboard
 from .reader import read_result, seed_folders
 
 if TYPE_CHECKING:

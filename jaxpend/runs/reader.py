@@ -315,7 +315,13 @@ def _changed(folder: Path) -> str:
 
 def _entry(folder: Path) -> dict[str, Any]:
     """One run folder as plain values; ``state`` is finished, running, interrupted or broken."""
-    about: dict[str, Any] = {"run": folder.name, "robot": None, "stages": [], "seed": None, "state": "broken"}
+    about: dict[str, Any] = {
+        "run": folder.name,
+        "robot": None,
+        "stages": [],
+        "seed": None,
+        "state": "broken",
+    }
     about |= {"at": None, "score": None, "seconds": None, "changed": _changed(folder)}
     try:
         config = _config(folder)
