@@ -57,13 +57,14 @@ docs: $(STAMP)  ## the reference: build/docs/index.html, from the docstrings
 test: $(STAMP)  ## the test suite
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)
 
-lint: $(STAMP)  ## ruff: rules and format
+lint: $(STAMP)  ## ruff: rules and format; mypy: types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
 
 bench: $(STAMP)  ## time rollouts, SAC and SNES on this machine
 	$(BIN)/python experiments/bench.py $(ARGS)
 
 clean:  ## remove the virtual environment and caches; runs/ stays
-	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis build *.egg-info
+	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build *.egg-info
 	find jaxpend tests experiments -name __pycache__ -type d -exec rm -rf {} +

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from jaxpend import cli, designs, leaderboard
+from jaxpend.boards import v2
 from jaxpend.controllers.catalogue import CATALOGUE, build
 from jaxpend.errors import choose
 from jaxpend.files import write_atomically
@@ -22,7 +23,7 @@ def merged(path: Path, robot: str, row: dict) -> dict:
     boards = json.loads(path.read_text()) if path.exists() else {}
     rows = boards.get(robot, {}).get("rows", [])
     rows = [r for r in rows if r["source"] == "measured" and r["name"] != row["name"]]
-    rows = [*rows, row, *leaderboard.published(robot)]
+    rows = [*rows, row, *leaderboard.published(v2(robot))]
     boards[robot] = {"robot": robot, "rows": sorted(rows, key=lambda r: -r["score"])}
     return boards
 
@@ -51,13 +52,9 @@ def main(
             title = CATALOGUE[name].title
             console.print(f"judging {title} of the {robot} ...")
             row = {"name": name, "title": title, "source": "measured"}
-            row |= leaderboard.judge(
-                partial(build, name, robot=robot),
-                robot,
-                keys=keys,
-                seed=seed,
-                robustness=robustness,
-            )
+            make = partial(build, name, robot=robot)
+            options = {"keys": keys, "seed": seed, "robustness": robustness}
+            row |= leaderboard.judge(make, v2(robot), **options)
             boards = merged(path, robot, row)
             cli.emit_json(boards, path)
             tables = [(r, leaderboard.markdown(boards[r])) for r in designs.ROBOTS if r in boards]

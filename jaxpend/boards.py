@@ -7,7 +7,7 @@ judges takes one. So training cannot touch official keys or grids, and another b
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -18,25 +18,14 @@ from .criteria import HEIGHT, Criteria, ScoreV2, criteria
 from .errors import JaxpendError, choose
 from .plant import Plant
 from .robots import ROBOTS, active_joint
+from .rollout import Trajectory
 from .scenario import Scenario
 from .variations import RANGES, sample
 
-if TYPE_CHECKING:
-    from .rollout import Trajectory
-
 __all__ = [
-    "CRITERIA",
-    "HEADINGS",
-    "V2",
-    "Board",
-    "Strip",
-    "Task",
-    "board",
-    "own_task",
-    "strips",
-    "task_of",
-    "v2",
-]
+    "CRITERIA", "HEADINGS", "V2", "Board", "Strip", "Task", "board", "own_task", "strips",
+    "task_of", "v2",
+]  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +73,7 @@ class Task:
         """A random imperfect scenario around the plant, see ``variations.sample``."""
         return sample(self.plant, key, share)
 
-    def criteria(self, run: "Trajectory", plant: Plant | None = None) -> Criteria:
+    def criteria(self, run: Trajectory, plant: Plant | None = None) -> Criteria:
         """The criteria of a trajectory; ``plant`` gives the link lengths, by default the task's."""
         plant = self.plant if plant is None else plant
         options = {"height": self.height, "t_final": self.duration}
@@ -199,8 +188,7 @@ def v2(robot: str) -> Board:
 def own_task(controller: Any, task: Task | None = None) -> Task:
     """``task``, or where there is none that of the v2 board of the robot a controller is for.
 
-    Raises:
-        JaxpendError: the controller does not say which robot it is for.
+    Raises ``JaxpendError`` if the controller does not say which robot it is for.
     """
     if task is not None:
         return task

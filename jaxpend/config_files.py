@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,14 +11,7 @@ from typing import Any, TypeVar
 from .errors import JaxpendError
 from .fields import checked, hints_of
 
-__all__ = [
-    "differing_field",
-    "from_mapping",
-    "load_config",
-    "read_yaml",
-    "recipes",
-    "to_mapping",
-]
+__all__ = ["flat", "from_mapping", "load_config", "read_yaml", "recipes", "to_mapping"]
 
 T = TypeVar("T")
 
@@ -107,14 +100,10 @@ def read_yaml(path: Any) -> Any:
         raise JaxpendError(f"{path} is not valid YAML{line}") from None
 
 
-def differing_field(stored: Any, given: Any, ignored: Sequence[str] = ()) -> str | None:
-    """The first field, dotted, in which two configurations as plain dicts differ; None: in none."""
-    if not isinstance(stored, dict) or not isinstance(given, dict):
-        return None if stored == given else ""
-    for name in {**given, **stored}:
-        if name in ignored:
-            continue
-        inner = differing_field(stored.get(name), given.get(name))
-        if inner is not None:
-            return f"{name}.{inner}".rstrip(".")
-    return None
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Fields of nested mappings, dotted, with their values."""
+    fields: dict[str, Any] = {}
+    for name, value in values.items():
+        deeper = isinstance(value, Mapping)
+        fields |= flat(value, f"{prefix}{name}.") if deeper else {prefix + name: value}
+    return fields

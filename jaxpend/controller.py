@@ -14,16 +14,9 @@ from .pytree import Pytree, pytree, static
 from .robots import ROBOTS
 
 __all__ = [
-    "Controller",
-    "Feedback",
-    "Memoryless",
-    "OpenLoop",
-    "Zero",
-    "check_controller",
-    "check_form",
-    "check_robot",
-    "robot_of",
-]
+    "Controller", "Feedback", "Memoryless", "OpenLoop", "Zero", "check_controller", "check_form",
+    "check_robot", "robot_of",
+]  # fmt: skip
 
 
 class Controller(Protocol):
@@ -31,13 +24,13 @@ class Controller(Protocol):
 
     def reset(self, key: jax.Array) -> Any:
         """Memory (any pytree) at the start of a run; ``key`` is consumed."""
-        ...
 
     def __call__(self, carry: Any, t: jax.Array, x: jax.Array) -> tuple[Any, jax.Array]:
         """New memory and torque (2,), N m, from memory, time (s) and measured state (4,)."""
-        ...
+        raise NotImplementedError
 
 
+LEAVES = jax.Array | np.ndarray | np.generic | float | int | jax.ShapeDtypeStruct
 HOW = (
     "a controller is a jaxpend.pytree.pytree dataclass with reset(key) -> carry and "
     "__call__(carry, t, x) -> (carry, torque (2,))"
@@ -59,10 +52,9 @@ def check_form(controller: Any) -> None:
     for leaf in jax.tree.leaves(controller):
         if leaf is controller:
             raise JaxpendError(f"{name} is not a pytree, so jax cannot trace it; {HOW}")
-        if not isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int):
+        if not isinstance(leaf, LEAVES):
             what = type(leaf).__name__
-            if not isinstance(leaf, jax.ShapeDtypeStruct):
-                raise JaxpendError(f"{name} holds a {what} where an array should be; {HOW}")
+            raise JaxpendError(f"{name} holds a {what} where an array should be; {HOW}")
 
 
 def check_controller(controller: Any) -> None:
@@ -78,9 +70,8 @@ def check_controller(controller: Any) -> None:
     name = type(controller).__name__
     leaves, structure = jax.tree.flatten(controller)
     for leaf in leaves:
-        if isinstance(leaf, jax.core.Tracer | jax.ShapeDtypeStruct):
-            continue
-        if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) and np.isnan(leaf).any():
+        known = not isinstance(leaf, jax.core.Tracer | jax.ShapeDtypeStruct)
+        if known and jnp.issubdtype(jnp.result_type(leaf), jnp.floating) and np.isnan(leaf).any():
             raise JaxpendError(f"{name} holds a number that is NaN; all of them must be numbers")
     if hasattr(controller, "check"):
         controller.check()

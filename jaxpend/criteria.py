@@ -16,21 +16,9 @@ from .plant import Plant, tip_height
 from .pytree import Pytree, pytree
 
 __all__ = [
-    "EPSILON",
-    "HEIGHT",
-    "V1_DEFAULT",
-    "V1_OFFICIAL",
-    "V2_HARDWARE",
-    "V2_OFFICIAL",
-    "Criteria",
-    "ScoreV2",
-    "ScoreV3",
-    "criteria",
-    "score_v1",
-    "score_v2",
-    "score_v3",
-    "upright",
-]
+    "EPSILON", "HEIGHT", "V1_DEFAULT", "V1_OFFICIAL", "V2_HARDWARE", "V2_OFFICIAL", "Criteria",
+    "ScoreV2", "ScoreV3", "criteria", "score_v1", "score_v2", "score_v3", "upright",
+]  # fmt: skip
 
 HEIGHT = 0.9  # of the stretched height above joint 1: the line that a swing-up has to cross
 # criterion -> (weight, normalisation); the sums of the leaderboard's own configurations.
@@ -68,7 +56,7 @@ class Criteria(Pytree):
 
     @property
     def diverged(self) -> jax.Array:
-        """Whether the trajectory holds what is not a number; its score is that of a failure."""
+        """Whether the trajectory holds NaN or infinities; its score is that of a failure."""
         return ~jnp.isfinite(self.velocity_cost)
 
 
@@ -95,13 +83,7 @@ def _count_swingups(t: jax.Array, up: jax.Array, deadtime: float = 1.0) -> jax.A
 
 
 def criteria(
-    t: jax.Array,
-    x: jax.Array,
-    u: jax.Array,
-    plant: Plant,
-    *,
-    height: float = HEIGHT,
-    t_final: float = 10.0,
+    t: jax.Array, x: jax.Array, u: jax.Array, plant: Plant, *, height=HEIGHT, t_final=10.0
 ) -> Criteria:
     """The leaderboard's criteria of one trajectory or a batch of them.
 
@@ -124,27 +106,25 @@ def criteria(
     n = u.shape[-2] if u.ndim > 1 else 0
     fits = t.ndim > 0 and x.ndim > 1 and t.shape[-1] == x.shape[-2] and t.shape[-1] in (n, n + 1)
     if n < 3 or not fits or x.shape[-1] != 4 or u.shape[-1] != 2:
-        raise JaxpendError(
-            f"criteria need t (..., N or N+1), x (..., N or N+1, 4), u (..., N, 2) with N > 2; "
-            f"got t {t.shape}, x {x.shape}, u {u.shape}"
-        )
+        shapes = f"got t {t.shape}, x {x.shape}, u {u.shape}"
+        need = "t (..., N or N+1), x (..., N or N+1, 4), u (..., N, 2) with N > 2"
+        raise JaxpendError(f"criteria need {need}; {shapes}")
     t, x = t[..., :n], x[..., :n, :]
     up = tip_height(plant.length, x) > height * (plant.length[0] + plant.length[1])
-    dt, held, moves = jnp.diff(t), u[..., :-1, :], jnp.diff(x[..., :2], axis=-2)
+    dt, held, moves = jnp.diff(t)[..., None], u[..., :-1, :], jnp.diff(x[..., :2], axis=-2)
     stamps = jnp.broadcast_to(t, up.shape)
     index = _swingup_index(up)
     swingup_time = jnp.take_along_axis(stamps, index[..., None], axis=-1)[..., 0]
     swingup_time = jnp.where(stamps[..., -1] < 0.99 * t_final, jnp.inf, swingup_time)
-    velocity = x[..., :-1, 2:]
     since_last = jnp.diff(t, prepend=jnp.zeros_like(t[..., :1]))
     return Criteria(
         swingup_time=swingup_time,
         max_tau=jnp.max(jnp.abs(u), axis=(-2, -1)),
         energy=jnp.sum(jnp.abs(moves * held), axis=(-2, -1)),
-        integ_tau=jnp.sum(jnp.abs(held) * dt[..., None], axis=(-2, -1)),
-        tau_cost=jnp.sum(held**2 * dt[..., None], axis=(-2, -1)),
+        integ_tau=jnp.sum(jnp.abs(held) * dt, axis=(-2, -1)),
+        tau_cost=jnp.sum(held**2 * dt, axis=(-2, -1)),
         tau_smoothness=jnp.sum(jnp.std(jnp.diff(u, axis=-2), axis=-2), axis=-1),
-        velocity_cost=jnp.sum(velocity**2 * dt[..., None], axis=(-2, -1)),
+        velocity_cost=jnp.sum(x[..., :-1, 2:] ** 2 * dt, axis=(-2, -1)),
         uptime=jnp.sum(jnp.where(up, since_last, 0.0), axis=-1),
         number_of_swingups=_count_swingups(t, up),
         success=swingup_time < stamps[..., -1],
@@ -196,7 +176,7 @@ EPSILON = (0.35, 0.35, 1.0, 1.0)
 
 
 def upright(x: jax.Array) -> jax.Array:
-    """Whether states (..., 4) are within ``EPSILON`` of upright; False for what is not a number.
+    """Whether states (..., 4) are within ``EPSILON`` of upright; False where the state is NaN.
 
     theta1 is taken modulo 2 pi and theta2 wrapped to [-pi, pi), as the benchmark does.
     """

@@ -1,8 +1,9 @@
 """The analytic gradient of a smooth form of the official score, through the simulator.
 
-The closed loop is differentiated from end to end: what a parameter does to the score seconds
-later is known, not sampled. Adam (Kingma and Ba, 2015) climbs from a trained policy, or from any
-other controller that declares what may be searched (``controllers/search_space.py``),
+The closed loop is differentiated from end to end, so that the effect of a parameter on the score
+seconds later is computed and not estimated from samples. Adam (Kingma and Ba, 2015) climbs from a
+trained policy, or from any other controller that declares what may be searched
+(``controllers/search_space.py``),
 
     (1 - w) smooth v2 score of the nominal run + w mean upright time of random scenarios
 
@@ -12,8 +13,8 @@ over a run and over imperfect scenarios (``variations.sample``, new ones every s
 
 Where motion is chaotic the gradient explodes and says nothing. Therefore the window is
 ``duration`` long, the norm of each run's gradient is clipped before they are averaged, a run
-whose gradient is not finite is left out and counted, and in scenarios what a state does to later
-ones fades from the gradient (``memory``).
+whose gradient is not finite is left out and counted, and in scenarios the effect of a state on
+later states fades from the gradient, with the time constant ``memory``.
 """
 
 import math
@@ -28,13 +29,13 @@ import optax
 from .boards import Task, own_task
 from .config import GradientConfig, Run
 from .controller import Controller, check_controller
-from .controllers.search_space import coordinates, kinds
+from .controllers.search_space import coordinates
 from .criteria import EPSILON
 from .plant import rk4_step
 from .pytree import Pytree, pytree
 from .rollout import rollout
 from .scenario import Scenario
-from .stage import Chart, SearchStage, SearchState
+from .stage import Candidates, Chart, Row, SearchStage, SearchState
 from .trajopt.swingup import SwingUp, smooth_score, totals
 from .variations import LONGEST_DELAY
 
@@ -65,8 +66,8 @@ def _fading(memory: float):
 def performance(config: GradientConfig, controller: Controller, task: Task) -> jax.Array:
     """Smooth score of the first ``config.duration`` s of the nominal run."""
     run = rollout(task.plant, controller, jax.random.key(0), dt=task.dt, duration=config.duration)
-    width = jnp.asarray(config.line_width), jnp.asarray(config.power_width)
-    p = SwingUp(task.plant, None, None, *width, task=task, dt=task.dt)
+    line, power = jnp.asarray(config.line_width), jnp.asarray(config.power_width)
+    p = SwingUp(task.plant, None, None, line, power, task, task.dt)
     return smooth_score(p, totals(p, run.x, run.u[:, task.joint]))
 
 
@@ -120,8 +121,8 @@ def slope(config: GradientConfig, start: Controller, task: Task, z: jax.Array, k
 def _adam(config: GradientConfig, weights: np.ndarray) -> optax.GradientTransformation:
     """Adam, warmed up, then with cosine decay; weights and all else have step sizes of their own.
 
-    Adam's first steps are as long as all others, however small the gradient; without a warm-up
-    they lost the swing-up.
+    Adam's first steps are as long as later ones, even where the gradient is small; without a
+    warm-up they destroyed the swing-up.
     """
     rates = np.where(weights, config.learning_rate, config.gain_learning_rate)
     decay = optax.warmup_cosine_decay_schedule(
@@ -132,7 +133,7 @@ def _adam(config: GradientConfig, weights: np.ndarray) -> optax.GradientTransfor
 
 
 def init(config: GradientConfig, controller: Controller, key: jax.Array) -> GradientState:
-    """At the controller, before the first step. Raises as ``search_space.kinds``."""
+    """The state at the controller, before the first step. Raises as ``search_space.kinds``."""
     check_controller(controller)
     z, weights, _ = coordinates(controller, config.searched)
     return GradientState(z, _adam(config, weights).init(z), key, jnp.zeros((), jnp.int32))
@@ -165,7 +166,7 @@ def improve(
 
 
 def current(config: GradientConfig, start: Controller, state: GradientState) -> Controller:
-    """The controller where the ascent is."""
+    """The controller at the parameters that the ascent has reached."""
     return coordinates(start, config.searched)[-1](state.parameters)
 
 
@@ -180,49 +181,28 @@ class Gradient(SearchStage):
         Chart("Norm of the gradient", {"norm": "slope"}, log=True),
     )
 
-    def __init__(self, config: GradientConfig, policy: Controller, task: Task):
-        """``policy`` is a controller of the structure that the ascent starts from.
-
-        Raises ``JaxpendError`` if it has nothing to search.
-        """
-        kinds(policy, config.searched)
-        self.config, self.total = config, config.steps
-        self.policy, self.task = policy, task
-
     @classmethod
     def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
         config = getattr(run, "gradient", None)
-        if not (config and config.steps):
-            return None
-        assert start is not None  # a run of this stage alone names one
-        return cls(config, start, task)
+        return cls(config, start, task) if config and config.steps else None
 
-    def start(self, seed: int, before: Controller) -> SearchState:
+    def begin(self, seed: int, controller: Controller) -> SearchState:
         key = jax.random.fold_in(jax.random.key(seed), 2)
-        return SearchState(before, init(self.config, before, key), jnp.asarray(0))
+        return SearchState(controller, init(self.config, controller, key), jnp.asarray(0))
 
-    def like(self) -> SearchState:
-        return jax.eval_shape(lambda policy: self.start(0, policy), self.policy)
+    def search(self, states: list[SearchState], count: int) -> list[tuple[GradientState, Row]]:
+        return [improve(self.config, s.start, s.search, count, self.task) for s in states]
 
-    def advance(self, states: list[SearchState]) -> list[tuple[SearchState, dict[str, Any]]]:
-        count, after = self.chunk(states[0]), []
-        for state in states:
-            search, metrics = improve(self.config, state.start, state.search, count, self.task)
-            after.append((self.moved(state, search, count), metrics))
-        return after
-
-    def judge(
-        self, state: SearchState, metrics: dict[str, Any]
-    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
+    def judge(self, state: SearchState, metrics: Row) -> tuple[Row, Candidates]:
         policy = current(self.config, state.start, state.search)
         score, worth = self.compared(policy)
         row = {"score": score, "value": worth, "lost": int(state.search.lost)}
         return row | {name: values[-1] for name, values in metrics.items()}, [(policy, worth)]
 
-    def note(self, row: dict[str, Any]) -> str:
+    def note(self, row: Row) -> str:
         return f"smooth score {float(row['smooth_score']):.4f}  score {row['score']:.4f}"
 
-    def watched(self, state: SearchState) -> Any:
+    def watched(self, state: SearchState) -> jax.Array:
         return state.search.parameters
 
 

@@ -11,7 +11,8 @@ The equations of motion are
 (Spong, "The swing up control problem for the acrobot", 1995, with the reflected motor inertia
 and friction terms of Wiebe et al., "Open-source dual-purpose acrobot and pendubot platform",
 2023). Every function takes one plant and one state; use ``jax.vmap`` for batches of either.
-The 2x2 algebra is written out element by element: it fuses, and no matrix unit rounds it.
+The 2x2 algebra is written out element by element: XLA fuses it, and no device rounds it as it
+rounds matrix products.
 """
 
 import jax
@@ -21,23 +22,10 @@ import numpy as np
 from .pytree import Pytree, pytree
 
 __all__ = [
-    "UPRIGHT",
-    "Plant",
-    "coriolis_matrix",
-    "deviation",
-    "dynamics",
-    "euler_step",
-    "forward_kinematics",
-    "friction_vector",
-    "gravity_vector",
-    "kinetic_energy",
-    "linearize",
-    "mass_matrix",
-    "potential_energy",
-    "rk4_step",
-    "tip_height",
-    "total_energy",
-]
+    "UPRIGHT", "Plant", "coriolis_matrix", "deviation", "dynamics", "euler_step",
+    "forward_kinematics", "friction_vector", "gravity_vector", "kinetic_energy", "linearize",
+    "mass_matrix", "potential_energy", "rk4_step", "tip_height", "total_energy",
+]  # fmt: skip
 
 UPRIGHT = (np.pi, 0.0, 0.0, 0.0)
 # Steepness (s/rad) of the arctan that stands for the sign function in Coulomb friction.
@@ -82,9 +70,8 @@ def mass_matrix(plant: Plant, x: jax.Array) -> jax.Array:
 def coriolis_matrix(plant: Plant, x: jax.Array) -> jax.Array:
     """Coriolis and centrifugal matrix ``C(theta, omega)``, shape (2, 2), N m s/rad."""
     h = plant.mass[1] * plant.length[0] * plant.com[1] * jnp.sin(x[1])
-    return jnp.stack(
-        [jnp.stack([-2 * h * x[3], -h * x[3]]), jnp.stack([h * x[2], jnp.zeros_like(h)])]
-    )
+    first, second = [-2 * h * x[3], -h * x[3]], [h * x[2], jnp.zeros_like(h)]
+    return jnp.stack([jnp.stack(first), jnp.stack(second)])
 
 
 def gravity_vector(plant: Plant, x: jax.Array) -> jax.Array:
@@ -105,8 +92,8 @@ def _arctan(x: jax.Array) -> jax.Array:
         return jnp.arctan(x)
     a = jnp.abs(x)
     middle, far = a > 0.41421356, a > 2.41421356
-    top = jnp.where(far, -1.0, jnp.where(middle, a - 1.0, a))
-    r = top / jnp.where(far, a, jnp.where(middle, a + 1.0, 1.0))
+    numerator = jnp.where(far, -1.0, jnp.where(middle, a - 1.0, a))
+    r = numerator / jnp.where(far, a, jnp.where(middle, a + 1.0, 1.0))
     offset = jnp.where(far, jnp.pi / 2, jnp.where(middle, jnp.pi / 4, 0.0))
     z = r * r
     p = ((8.05374449538e-2 * z - 1.38776856032e-1) * z + 1.99777106478e-1) * z - 3.33329491539e-1
@@ -114,23 +101,13 @@ def _arctan(x: jax.Array) -> jax.Array:
     return jnp.where(x < 0, -y, y)
 
 
-def _is_frictionless(plant: Plant) -> bool:
-    """Whether Coulomb friction is known, while tracing, to be zero.
-
-    The arctan is most of the cost of a step, so it is worth leaving out.
-    """
-    friction = plant.coulomb_friction
-    if isinstance(friction, jax.core.Tracer):
-        return False
-    return friction is None or not np.asarray(friction).any()
-
-
 def friction_vector(plant: Plant, x: jax.Array) -> jax.Array:
     """Friction torque ``F(omega) = b omega + c arctan(100 omega)``, shape (2,), N m."""
-    viscous = plant.damping * x[2:4]
-    if plant.coulomb_friction is None or _is_frictionless(plant):
-        return viscous
-    return viscous + plant.coulomb_friction * _arctan(COULOMB_STEEPNESS * x[2:4])
+    viscous, coulomb = plant.damping * x[2:4], plant.coulomb_friction
+    known = not isinstance(coulomb, jax.core.Tracer)
+    if coulomb is None or (known and not np.asarray(coulomb).any()):
+        return viscous  # the arctan is most of the cost of a step
+    return viscous + coulomb * _arctan(COULOMB_STEEPNESS * x[2:4])
 
 
 def dynamics(plant: Plant, x: jax.Array, u: jax.Array) -> jax.Array:
@@ -184,8 +161,7 @@ def tip_height(length: jax.Array, x: jax.Array) -> jax.Array:
 
 def deviation(x: jax.Array, goal: jax.Array) -> jax.Array:
     """``x - goal``, (4,), with the angles wrapped to [-pi, pi)."""
-    turn = 2 * jnp.pi
-    angle = jnp.remainder(x[:2] - goal[:2] + jnp.pi, turn) - jnp.pi
+    angle = jnp.remainder(x[:2] - goal[:2] + jnp.pi, 2 * jnp.pi) - jnp.pi
     return jnp.concatenate([angle, x[2:] - goal[2:]])
 
 

@@ -23,23 +23,16 @@ from .boards import CRITERIA, Board, Strip, board, strips
 from .controller import Controller, check_robot
 from .errors import JaxpendError, choose
 from .plant import Plant
-from .scenario import DT, DURATION, Pulses, Scenario
-from .sweep import compile_sweep, survey, sweep
+from .scenario import DT, Scenario, with_neutral
+from .sweep import at_least_one, compile_sweep, survey, sweep
 from .variations import INERTIAL, RANGES, VARIATIONS, vary
 
 __all__ = [
-    "CRITERIA",
-    "KEYS",
-    "Report",
-    "Strip",
-    "benchmark",
-    "nominal_and_worst",
-    "passes",
-    "strips",
+    "CRITERIA", "KEYS", "Report", "Strip", "benchmark", "nominal_and_worst", "passes", "strips",
     "success_map",
-]
+]  # fmt: skip
 
-KEYS = 3  # by default; of one key, runs at the edge move the robustness by up to 0.03
+KEYS = 3  # by default; with one key, runs at the edge of failure change the result by up to 0.03
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,15 +67,9 @@ class Report:
             if self.performance is not None:
                 grid["performance"] = self.performance[name].tolist()
             criteria[strip.criterion]["grids"][name] = grid
-        over_keys = {
-            "keys": len(by_key),
-            "mean": float(by_key.mean()),
-            "std": float(by_key.std()),
-            "min": float(by_key.min()),
-            "max": float(by_key.max()),
-            "overall": self.overall_by_key,
-            "scores": self.scores_by_key,
-        }
+        over_keys: dict[str, Any] = {"keys": len(by_key)}
+        over_keys |= {how: float(getattr(by_key, how)()) for how in ("mean", "std", "min", "max")}
+        over_keys |= {"overall": self.overall_by_key, "scores": self.scores_by_key}
         return {
             "overall": self.overall,
             "scores": self.scores,
@@ -107,45 +94,16 @@ def _base(nominal: Scenario, strips: Iterable[Strip]) -> Scenario:
     cost a run is little beside what six programs cost to compile.
     """
 
-    def full(value: float, *shape: int) -> Any:
-        return np.full(shape, value, nominal.dtype)
-
-    neutral = {
-        "delay": np.zeros(4, "i4"),
-        "responsiveness": full(1),
-        "measurement_noise": full(0, 4),
-        "torque_noise": full(0, 2),
-        "process_noise": full(0, 4),
-        "pulses": Pulses(full(0, 2, 3), full(1, 2, 3), full(0, 2, 3)),
-    }
-    names = {strip.variation for strip in strips}
-    touched = {
-        "delay": {"delay", "velocity_delay"},
-        "measurement_noise": {"velocity_noise", "position_noise"},
-        "pulses": {"perturbation"},
-    }
-    absent = {
-        field: value
-        for field, value in neutral.items()
-        if getattr(nominal, field) is None and touched.get(field, {field}) & names
-    }
-    base = nominal.replace(**absent)
-    if base.plant.coulomb_friction is None and {"cf1", "cf2"} & names:
-        base = base.replace(plant=base.plant.replace(coulomb_friction=full(0, 2)))
-    return base
+    varied = {VARIATIONS[strip.variation].field for strip in strips}
+    return with_neutral(nominal, varied)
 
 
 def _scenarios(base: Scenario, strips: Iterable[Strip], key: jax.Array, dt: float) -> Scenario:
     """One batch with every run of the strips, repetitions innermost."""
-    batches = [
-        vary(
-            base,
-            {s.variation: np.repeat(s.values, s.repetitions)},
-            key=jax.random.fold_in(key, number),
-            dt=dt,
-        )
-        for number, s in enumerate(strips)
-    ]
+    batches = []
+    for number, strip in enumerate(strips):
+        changes = {strip.variation: np.repeat(strip.values, strip.repetitions)}
+        batches.append(vary(base, changes, key=jax.random.fold_in(key, number), dt=dt))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *batches)
 
 
@@ -177,8 +135,7 @@ def _named(grids: Iterable[Strip]) -> dict[str, Strip]:
     named: dict[str, Strip] = {}
     for strip in grids:
         choose("variation", strip.variation, VARIATIONS)
-        if strip.repetitions < 1:
-            raise JaxpendError(f"repetitions is {strip.repetitions}; it must be at least 1")
+        at_least_one(repetitions=strip.repetitions)
         count = sum(other.variation == strip.variation for other in named.values())
         name = f"{strip.variation} ({count + 1})" if count else strip.variation
         named[name] = dataclasses.replace(strip, values=np.atleast_1d(strip.values))
@@ -193,11 +150,8 @@ def benchmark(
     key: jax.Array,
     *,
     keys: int = KEYS,
-    scored: bool = False,
-    dt: float = DT,
-    duration: float = DURATION,
-    chunk: int | None = None,
     grids: Sequence[Strip] | None = None,
+    **options: Any,
 ) -> Report:
     """Judge a controller.
 
@@ -209,30 +163,29 @@ def benchmark(
         key: split per key, criterion, scenario and run.
         keys: how often what draws something (noise, disturbances) is repeated; what is reported
             is the median.
-        scored: the mean v2 performance score at every grid value too.
-        dt, duration: s; the perturbations need 10 s.
-        chunk: of ``sweep``.
         grids: other strips than the official ones, of any criteria and variations.
+        **options: of ``sweep``; time grid and score are those of a board unless given here. The
+            perturbations need 10 s.
 
     Raises:
         JaxpendError: fewer than one key, no strips, a controller of the other robot, or as
             ``sweep``.
     """
-    if keys < 1:
-        raise JaxpendError(f"keys is {keys}; it must be at least 1")
+    at_least_one(keys=keys)
     trials: Callable[[Plant], list[Strip]] = strips
     if isinstance(judged_on, Board | str):
         official = board(judged_on)
         check_robot(controller, official.robot)
-        judged_on, trials = official.task.plant, official.trials
+        task, trials = official.task, official.trials
+        grid = {"dt": task.dt, "duration": task.duration}
+        options = grid | {"scoring": task.scoring, "height": task.height} | options
+        judged_on = task.plant
     nominal = Scenario(judged_on) if isinstance(judged_on, Plant) else judged_on
     named = _named(trials(nominal.plant) if grids is None else grids)
-    options: dict[str, Any] = {"scored": scored, "dt": dt, "duration": duration, "chunk": chunk}
-    rows = {
-        draws: {n: s for n, s in named.items() if VARIATIONS[s.variation].draws == draws}
-        for draws in (False, True)
-    }
-    jobs = {}
+    rows: dict[bool, dict[str, Strip]] = {False: {}, True: {}}
+    for name, strip in named.items():
+        rows[VARIATIONS[strip.variation].draws][name] = strip
+    jobs, dt = {}, options.get("dt", DT)
     for draws, its in rows.items():
         for number in range(keys if draws else 1) if its else ():
             draw_key, run_key = jax.random.split(jax.random.fold_in(key, number))
@@ -286,9 +239,6 @@ def _report(named, rows, outcomes, keys, **seconds) -> Report:
         simulations=sum(len(s.values) * s.repetitions for s in named.values()),
         **seconds,
     )
-
-
-# --- for the command ---------------------------------------------------------------------------
 
 
 def nominal_and_worst(plant: Plant) -> dict[str, tuple[float, float]]:

@@ -3,7 +3,6 @@
 import sys
 import types
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -16,22 +15,10 @@ from .plant import Plant, rk4_step
 from .pytree import Pytree, pytree
 from .scenario import DT, DURATION, Scenario
 
-__all__ = [
-    "Trajectory",
-    "actuate",
-    "draws",
-    "final_state",
-    "measure",
-    "rollout",
-    "time_stamps",
-]
+__all__ = ["Trajectory", "actuate", "draws", "final_state", "measure", "rollout", "time_stamps"]
 
 # Columns of the standard normals of one step, in the order of the reference simulator.
-NOISE = {
-    "measurement_noise": slice(0, 4),
-    "torque_noise": slice(4, 6),
-    "process_noise": slice(6, 10),
-}
+NOISE = {"measurement_noise": (0, 4), "torque_noise": (4, 6), "process_noise": (6, 10)}
 
 
 @pytree
@@ -64,9 +51,9 @@ def draws(scenario: Scenario, key, normals, steps: int, dtype) -> dict[str, jax.
     """
     noisy = [name for name in NOISE if getattr(scenario, name) is not None]
     if normals is not None:
-        return {name: jnp.asarray(normals, dtype)[:, NOISE[name]] for name in noisy}
+        return {name: jnp.asarray(normals, dtype)[:, slice(*NOISE[name])] for name in noisy}
     keys = dict(zip(NOISE, jax.random.split(key, len(NOISE)), strict=True))
-    columns = {name: NOISE[name].stop - NOISE[name].start for name in noisy}
+    columns = {name: NOISE[name][1] - NOISE[name][0] for name in noisy}
     return {name: jax.random.normal(keys[name], (steps, columns[name]), dtype) for name in noisy}
 
 
@@ -92,12 +79,13 @@ def actuate(scenario: Scenario, command, applied_before, t_pulse, z):
         u = u + scenario.torque_noise * z["torque_noise"]
     limit = scenario.plant.torque_limit
     u = jnp.clip(u, -limit, limit)
-    if scenario.pulses is not None:
-        u = u + scenario.pulses.torque(t_pulse)
-    return u
+    return u if scenario.pulses is None else u + scenario.pulses.torque(t_pulse)
 
 
-def _closed_loop(scenario, controller, key, dt, duration, integrator, delay_slots, normals, record):
+def _closed_loop(
+    scenario, controller, key, dt, duration, integrator, delay_slots, normals=None, record=False
+):
+    """``rollout`` without checks; only the last state unless ``record``."""
     stamps = time_stamps(dt, duration)
     steps = len(stamps) - 1
     dtype = scenario.dtype
@@ -139,19 +127,16 @@ def _closed_loop(scenario, controller, key, dt, duration, integrator, delay_slot
 def _check(scenario: Scenario | Plant, controller: Controller, delay_slots: int) -> Scenario:
     check_form(controller)
     scenario = Scenario(scenario) if isinstance(scenario, Plant) else scenario
-    if scenario.x0 is not None and jnp.shape(scenario.x0) != (4,):
+    if scenario.x0 is not None and (shape := jnp.shape(scenario.x0)) != (4,):
+        text = f"x0 has shape {shape}; one rollout starts from (4,): vmap over batches of scenarios"
+        raise JaxpendError(text)
+    known = None if isinstance(scenario.delay, jax.core.Tracer) else scenario.delay
+    longest = -1 if known is None else int(np.max(known))
+    if longest >= delay_slots:
         raise JaxpendError(
-            f"x0 has shape {jnp.shape(scenario.x0)}; one rollout starts from (4,): "
-            "vmap over batches of scenarios"
+            f"a delay of {longest} steps does not fit in a buffer of {delay_slots} states; "
+            f"pass delay_slots={longest + 1} or more"
         )
-    delay = scenario.delay
-    if delay is not None and not isinstance(delay, jax.core.Tracer):
-        longest = int(np.max(delay))
-        if longest >= delay_slots:
-            raise JaxpendError(
-                f"a delay of {longest} steps does not fit in a buffer of {delay_slots} states; "
-                f"pass delay_slots={longest + 1} or more"
-            )
     return scenario
 
 
@@ -187,16 +172,13 @@ def rollout(
             controller, or a torque of another shape.
     """
     scenario = _check(scenario, controller, delay_slots)
-    return _closed_loop(
-        scenario, controller, key, dt, duration, integrator, delay_slots, normals, record=True
-    )
+    options = (dt, duration, integrator, delay_slots)
+    return _closed_loop(scenario, controller, key, *options, normals, record=True)
 
 
-@partial(jax.jit, static_argnames=("dt", "duration", "integrator", "delay_slots"))
-def _final_state(scenario, controller, key, dt, duration, integrator, delay_slots):
-    return _closed_loop(
-        scenario, controller, key, dt, duration, integrator, delay_slots, None, record=False
-    )
+_final_state = jax.jit(
+    _closed_loop, static_argnames=("dt", "duration", "integrator", "delay_slots")
+)
 
 
 def final_state(

@@ -4,6 +4,9 @@ An imperfection that is ``None`` is left out of the compiled program, so the nom
 costs nothing; one that is an array may differ per rollout under ``jax.vmap``.
 """
 
+from collections.abc import Collection
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +15,10 @@ from .errors import JaxpendError, choose
 from .plant import Plant
 from .pytree import Pytree, pytree
 
-__all__ = ["DT", "DURATION", "Pulses", "Scenario", "check_values", "delay_steps", "random_pulses"]
+__all__ = [
+    "DT", "DURATION", "NEUTRAL", "Pulses", "Scenario", "check_values", "delay_steps",
+    "random_pulses", "with_neutral",
+]  # fmt: skip
 
 # Of the boards, and of everything here that does not say otherwise, s.
 DT = 0.002  # control and integration period
@@ -107,14 +113,32 @@ def random_pulses(
     )
 
 
-def _scales(scenario: Scenario):
-    """Names of what must not be negative, and the values."""
-    for name in ("measurement_noise", "delay", "process_noise", "torque_noise", "responsiveness"):
-        if getattr(scenario, name) is not None:
-            yield name, getattr(scenario, name)
-    yield "torque_limit", scenario.plant.torque_limit
-    if scenario.pulses is not None:
-        yield "pulse width", scenario.pulses.width
+# What an imperfection that is there has no effect with; all that is missing has a place here.
+NEUTRAL: dict[str, Any] = {
+    "delay": np.zeros(4, "i4"),
+    "responsiveness": np.ones(()),
+    "measurement_noise": np.zeros(4),
+    "torque_noise": np.zeros(2),
+    "process_noise": np.zeros(4),
+    "pulses": Pulses(np.zeros((2, 3)), np.ones((2, 3)), np.zeros((2, 3))),  # type: ignore[arg-type]
+}
+
+
+def with_neutral(scenario: Scenario, fields: Collection[str]) -> Scenario:
+    """The scenario with its neutral value in each of the fields that is ``None``.
+
+    "coulomb_friction" is that of the plant; names of other things than imperfections are ignored.
+    """
+    plant, dtype = scenario.plant, scenario.dtype
+
+    def cast(leaf):
+        return leaf.astype(dtype) if leaf.dtype.kind == "f" else leaf
+
+    absent = [name for name in NEUTRAL if name in fields and getattr(scenario, name) is None]
+    scenario = scenario.replace(**{n: jax.tree.map(cast, NEUTRAL[n]) for n in absent})
+    if "coulomb_friction" in fields and plant.coulomb_friction is None:
+        scenario = scenario.replace(plant=plant.replace(coulomb_friction=np.zeros(2, dtype)))
+    return scenario
 
 
 def check_values(scenario: Scenario) -> None:
@@ -124,11 +148,13 @@ def check_values(scenario: Scenario) -> None:
         JaxpendError: a negative noise, delay, responsiveness, width or torque limit, or a value
             that is not finite (torque limits may be infinite).
     """
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(scenario))
-    if traced:
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(scenario)):
         return
-    for name, value in _scales(scenario):
-        if np.any(np.asarray(value) < 0):
+    scales = {name: getattr(scenario, name) for name in NEUTRAL if name != "pulses"}
+    scales["torque_limit"] = scenario.plant.torque_limit
+    scales["pulse width"] = None if scenario.pulses is None else scenario.pulses.width
+    for name, value in scales.items():
+        if value is not None and np.any(np.asarray(value) < 0):
             raise JaxpendError(f"{name} is {np.min(value)}; it must not be negative")
     for path, value in jax.tree_util.tree_leaves_with_path(scenario):
         name = jax.tree_util.keystr(path, simple=True, separator=" ")

@@ -30,31 +30,14 @@ from .scenario import Scenario
 from .variations import LONGEST_DELAY
 
 __all__ = [
-    "V1_DEFAULT",
-    "V1_OFFICIAL",
-    "V2_HARDWARE",
-    "V2_OFFICIAL",
-    "Criteria",
-    "ScoreV2",
-    "ScoreV3",
-    "criteria",
-    "imperfect",
-    "nominal",
-    "nominal_run",
-    "official",
-    "performance",
-    "score_v1",
-    "score_v2",
-    "score_v3",
-]
+    "V1_DEFAULT", "V1_OFFICIAL", "V2_HARDWARE", "V2_OFFICIAL", "Criteria", "ScoreV2", "ScoreV3",
+    "criteria", "imperfect", "nominal", "nominal_run", "official", "performance", "score_v1",
+    "score_v2", "score_v3",
+]  # fmt: skip
 
 
 def performance(
-    controller: Controller,
-    scenario: Scenario | Plant,
-    key: jax.Array,
-    task: Task,
-    **options: Any,
+    controller: Controller, scenario: Scenario | Plant, key: jax.Array, task: Task, **options: Any
 ) -> Criteria:
     """Criteria of a run on the time grid of a task, on a plant or on a scenario around one.
 

@@ -4,9 +4,9 @@ SNES (Wierstra et al., "Natural evolution strategies", JMLR 2014; evosax) starts
 policy, or from any other controller that declares what may be searched
 (``controllers/search_space.py``). The fitness of an individual is its score in the task (10 s at
 500 Hz on the v2 boards), averaged over rollouts in which a policy's greedy action is un-squashed,
-disturbed by Gaussian noise and squashed again (Calì et al., 2024), so that what is found stands
-on wide ground. All individuals of a generation meet the same noise: common random numbers make
-the comparison fair. Other strategies of evosax stand behind the same options.
+disturbed by Gaussian noise and squashed again (Calì et al., 2024), so that the score of what is
+found does not depend on exact torques. All individuals of a generation meet the same noise: common
+random numbers make the comparison fair. Other strategies of evosax can be chosen by ``strategy``.
 """
 
 import dataclasses
@@ -24,21 +24,15 @@ from .config import GuardConfig, Run, SNESConfig
 from .controller import Controller, check_controller
 from .controllers.guard import guard
 from .controllers.policy import change_policies
-from .controllers.search_space import coordinates, kinds
+from .controllers.search_space import coordinates
 from .pytree import Pytree, pytree
 from .score import imperfect, performance
-from .stage import Chart, SearchStage, SearchState
+from .stage import Candidates, Chart, Row, SearchStage, SearchState
 
 __all__ = [
-    "SNES",
-    "SNESConfig",
-    "SNESState",
-    "best_controller",
-    "evolve",
-    "fitness",
-    "init",
+    "SNES", "SNESConfig", "SNESState", "best_controller", "evolve", "fitness", "init",
     "mean_controller",
-]
+]  # fmt: skip
 
 STRATEGIES = {name: getattr(algorithms, kind) for name, kind in config.STRATEGIES.items()}
 
@@ -72,23 +66,23 @@ def fitness(
     keys = jax.random.split(key_noise, config.rollouts if draws else 1)
     c = jax.vmap(lambda k: performance(noisy, plant, k, task))(keys)
     score, diverged = task.score(c).mean(), jnp.sum(c.diverged)
-    if not config.scenarios:
-        return score, diverged
-    c = imperfect(controller, task, key_scenarios, config.scenarios)
-    weight = config.scenario_weight
-    score = (1 - weight) * score + weight * task.score(c).mean()
-    return score, diverged + jnp.sum(c.diverged)
+    if config.scenarios:
+        c = imperfect(controller, task, key_scenarios, config.scenarios)
+        weight = config.scenario_weight
+        score = (1 - weight) * score + weight * task.score(c).mean()
+        diverged = diverged + jnp.sum(c.diverged)
+    return score, diverged
 
 
 class _Search:
     """The strategy of a configuration on the coordinates of a controller.
 
     Only SNES takes a standard deviation for each coordinate. The others search in units of it:
-    coordinate = ``unit`` z.
+    coordinate = ``unit`` z, and ``rebuild`` gives the controller at a z.
     """
 
     def __init__(self, config: SNESConfig, controller: Controller):
-        flat, weights, self._rebuild = coordinates(controller, config.searched)
+        flat, weights, rebuild = coordinates(controller, config.searched)
         std = jnp.where(weights, config.sigma, config.gain_sigma).astype(flat.dtype)
 
         def shrunk(generation):
@@ -100,7 +94,7 @@ class _Search:
         self.decay = 1.0 if options else config.final_sigma ** (1.0 / config.generations)
         per_coordinate = config.strategy == "snes"
         self.unit = jnp.ones((), flat.dtype) if per_coordinate else std
-        self.start = flat / self.unit
+        self.start, self.rebuild = flat / self.unit, lambda z: rebuild(self.unit * z)
         kind = STRATEGIES[config.strategy]
         self.strategy = kind(population_size=config.population, solution=flat, **options)
         with jax.ensure_compile_time_eval():  # LM-MA-ES turns a number of vectors into an int
@@ -108,10 +102,6 @@ class _Search:
         if hasattr(self.params, "std_init"):
             first = std if per_coordinate else jnp.ones((), flat.dtype)
             self.params = self.params.replace(std_init=first)
-
-    def rebuild(self, z: jax.Array) -> Controller:
-        """The controller at ``z``."""
-        return self._rebuild(self.unit * z)
 
 
 def init(config: SNESConfig, controller: Controller, key: jax.Array) -> SNESState:
@@ -124,7 +114,8 @@ def init(config: SNESConfig, controller: Controller, key: jax.Array) -> SNESStat
     key, key_init = jax.random.split(key)
     state = search.strategy.init(key_init, search.start, search.params)
     state = SNESState(state, key, search.start, jnp.asarray(-jnp.inf), jnp.zeros((), jnp.int32))
-    # Weak types would be strong after the first chunk, and ``evolve`` compiled a second time.
+    # jax would change weak types after the first chunk and compile ``evolve`` again, so all types
+    # are made strong here.
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf)), state)
 
 
@@ -148,9 +139,8 @@ def evolve(
     def generation(state, _):
         key, key_ask, key_noise, key_tell = jax.random.split(state.key, 4)
         population, inner = strategy.ask(key_ask, state.strategy, params)
-        scores, diverged = jax.vmap(lambda p: fitness(config, search.rebuild(p), key_noise, task))(
-            population
-        )
+        judged = jax.vmap(lambda p: fitness(config, search.rebuild(p), key_noise, task))
+        scores, diverged = judged(population)
         if config.strategy == "lm_ma_es":  # evosax weighs what it remembers by place, not by rank
             order = jnp.argsort(-scores)
             population, scores = population[order], scores[order]
@@ -201,66 +191,37 @@ class SNES(SearchStage):
     def __init__(
         self, config: SNESConfig, policy: Any, task: Task, guarding: GuardConfig | None = None
     ):
-        """``policy`` is a controller of the structure that the search starts from, before a guard.
-
-        Raises ``JaxpendError`` if it has nothing to search.
-        """
-        self.config, self.total, self.task = config, config.generations, task
-        self.guarding = guarding or GuardConfig()
+        """``policy`` is a controller of the structure that the search starts from, unguarded."""
+        self.guarding, self.task = dataclasses.asdict(guarding or GuardConfig()), task
         shapes = jax.eval_shape(lambda p: p, policy)
-        self.policy = self.guarded(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes))
-        kinds(self.policy, config.searched)
+        zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+        super().__init__(config, self.prepared(zeros), task)
         self.fresh_fitness = jax.jit(lambda p, key: fitness(config, p, key, task)[0])
-
-        def evolve_all(policies, searches, count):
-            def one(policy, search):
-                return evolve(config, policy, search, count, task)
-
-            return jax.vmap(one)(policies, searches)
-
-        self.evolve_all = jax.jit(evolve_all, static_argnames="count")
 
     @classmethod
     def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
         config = getattr(run, "snes", None)
         return cls(config, start, task, getattr(run, "guard", None)) if config else None
 
-    def guarded(self, controller: Controller) -> Controller:
-        """The controller that is searched."""
-        options = dataclasses.asdict(self.guarding)
-        return guard(controller, self.task.robot, self.task.plant, **options)
+    def prepared(self, controller: Controller) -> Controller:
+        return guard(controller, self.task.robot, self.task.plant, **self.guarding)
 
-    def start(self, seed: int, before: Controller) -> SearchState:
-        return self._begin(self.guarded(before), *self._keys(seed))
+    def begin(self, seed: int, controller: Controller) -> SearchState:
+        key, fresh = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
+        return SearchState(controller, init(self.config, controller, key), jnp.asarray(0), fresh)
 
-    def _keys(self, seed):
-        return jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
+    def search(self, states: list[SearchState], count: int) -> list[tuple[SNESState, Row]]:
+        def chunk(start, search):
+            return evolve(self.config, start, search, count, self.task)
 
-    def _begin(self, start, key_init, key_fresh):
-        search = init(self.config, start, key_init)
-        return SearchState(start, search, jnp.asarray(0), key_fresh)
-
-    def like(self) -> SearchState:
-        return jax.eval_shape(self._begin, self.policy, *self._keys(0))
-
-    def advance(self, states: list[SearchState]) -> list[tuple[SearchState, dict[str, Any]]]:
-        count = self.chunk(states[0])
         both = [(state.start, state.search) for state in states]
         if len(states) == 1:
-            after = [evolve(self.config, *both[0], count, self.task)]
-        else:
-            stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *both)
-            found = self.evolve_all(*stacked, count)
-            after = [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(states))]
-        return [
-            (self.moved(state, search, count), metrics)
-            for state, (search, metrics) in zip(states, after, strict=True)
-        ]
+            return [chunk(*both[0])]
+        found = jax.vmap(chunk)(*jax.tree.map(lambda *leaves: jnp.stack(leaves), *both))
+        return [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(states))]
 
-    def judge(
-        self, state: SearchState, metrics: dict[str, Any]
-    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
-        row: dict[str, Any] = {"diverged": int(state.search.diverged)}
+    def judge(self, state: SearchState, metrics: Row) -> tuple[Row, Candidates]:
+        row: Row = {"diverged": int(state.search.diverged)}
         row |= {name: values[-1] for name, values in metrics.items()}
         assert state.fresh is not None
         key, candidates = jax.random.fold_in(state.fresh, self.done(state)), []
@@ -272,10 +233,10 @@ class SNES(SearchStage):
             candidates.append((policy, worth))
         return row, candidates
 
-    def note(self, row: dict[str, Any]) -> str:
+    def note(self, row: Row) -> str:
         return f"fitness {float(row['mean_fitness']):.3f}  mean {row['mean_score']:.4f}"
 
-    def watched(self, state: SearchState) -> Any:
+    def watched(self, state: SearchState) -> tuple[jax.Array, jax.Array]:
         return state.search.strategy.mean, state.search.strategy.std
 
 

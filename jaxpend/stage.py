@@ -8,21 +8,25 @@ the configuration.
 """
 
 from functools import partial
-from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar
 
 import jax
 
 from .boards import Task
 from .config import GradientConfig, Run, SNESConfig
 from .controller import Controller
+from .controllers.search_space import kinds
 from .pytree import Pytree, pytree
 from .score import imperfect, nominal
 
-__all__ = ["Chart", "SearchStage", "SearchState", "Stage", "value"]
+__all__ = ["Candidates", "Chart", "Row", "SearchStage", "SearchState", "Stage", "value"]
 
-Before = TypeVar("Before")  # what a stage starts from
+Row = dict[str, Any]  # of metrics
+Candidates = list[tuple[Controller, float]]  # with their scores
+
+Before = TypeVar("Before", contravariant=True)  # what a stage starts from
 State = TypeVar("State")  # what it changes, a pytree
-After = TypeVar("After")  # what the next stage starts from
+After = TypeVar("After", covariant=True)  # what the next stage starts from
 
 
 class Chart(NamedTuple):
@@ -34,7 +38,7 @@ class Chart(NamedTuple):
     log: bool = False
 
 
-class Stage(Generic[Before, State, After]):
+class Stage(Protocol[Before, State, After]):
     """What the stages share; every method is pure."""
 
     name: ClassVar[str]  # in metrics, file names and results
@@ -54,7 +58,6 @@ class Stage(Generic[Before, State, After]):
 
         ``start`` is a controller of the structure that the stage before ends with.
         """
-        raise NotImplementedError
 
     def about(self) -> dict[str, Any]:
         """What others need to know of it, as plain values."""
@@ -63,45 +66,35 @@ class Stage(Generic[Before, State, After]):
 
     def start(self, seed: int, before: Before) -> State:
         """The state before the first chunk; ``before`` is the ``outcome`` of the last stage."""
-        raise NotImplementedError
 
     def like(self) -> State:
         """A state without numbers: the structure that checkpoints are read into."""
-        raise NotImplementedError
 
     def policy_like(self) -> Controller | None:
         """The same of a controller that it makes; None: it makes none."""
-        raise NotImplementedError
+        return None
 
     def done(self, state: State) -> int:
         """How much of ``total`` is done."""
-        raise NotImplementedError
 
-    def advance(self, states: list[State]) -> list[tuple[State, dict[str, Any]]]:
+    def advance(self, states: list[State]) -> list[tuple[State, Row]]:
         """The next chunk of one run, or of several at the same step; states and metrics."""
-        raise NotImplementedError
 
-    def judge(
-        self, state: State, metrics: dict[str, Any]
-    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
+    def judge(self, state: State, metrics: Row) -> tuple[Row, Candidates]:
         """A row of metrics, and controllers with their scores, the last one of training first."""
-        raise NotImplementedError
 
-    def note(self, row: dict[str, Any]) -> str:
+    def note(self, row: Row) -> str:
         """What a row of metrics says, for people."""
-        raise NotImplementedError
 
     def watched(self, state: State) -> Any:
         """What has to be finite, besides the metrics."""
-        raise NotImplementedError
 
     def rekey(self, state: State, number: int) -> State:
         """The same state, to go on from with other random numbers."""
-        raise NotImplementedError
 
-    def outcome(self, state: State, best: Controller | None) -> After:
-        """What the next stage starts from."""
-        raise NotImplementedError
+    def outcome(self, state: State, best: Any) -> After:
+        """What the next stage starts from: the best controller."""
+        return best
 
 
 # --- searches on the score -----------------------------------------------------------------
@@ -144,9 +137,32 @@ class SearchState(Pytree):
 class SearchStage(Stage[Controller, SearchState, Controller]):
     """What the gradient and SNES share: they go on from a controller, and end with the best."""
 
-    config: Any
-    task: Task
-    policy: Controller  # of the structure that is searched
+    def __init__(self, config: Any, policy: Any, task: Task):
+        """``policy`` is a controller of the structure that is searched.
+
+        Raises ``JaxpendError`` if it has nothing to search.
+        """
+        kinds(policy, config.searched)
+        self.config, self.policy, self.task = config, policy, task
+        self.total = getattr(config, self.unit)  # the field is called like what it counts
+
+    def prepared(self, controller: Controller) -> Controller:
+        """The controller that is searched, of one to start from."""
+        return controller
+
+    def begin(self, seed: int, controller: Controller) -> SearchState:
+        """The state before the first chunk, of the controller that is searched."""
+        raise NotImplementedError
+
+    def search(self, states: list[SearchState], count: int) -> list[tuple[Any, Row]]:
+        """``SearchState.search`` after ``count`` steps, and their metrics (count,)."""
+        raise NotImplementedError
+
+    def start(self, seed: int, before: Controller) -> SearchState:
+        return self.begin(seed, self.prepared(before))
+
+    def like(self) -> SearchState:
+        return jax.eval_shape(partial(self.begin, 0), self.policy)
 
     def policy_like(self) -> Controller:
         return self.policy
@@ -154,13 +170,12 @@ class SearchStage(Stage[Controller, SearchState, Controller]):
     def done(self, state: SearchState) -> int:
         return int(state.done)
 
-    def chunk(self, state: SearchState) -> int:
-        """Steps of the next chunk."""
-        return min(self.config.chunk, self.total - self.done(state))
-
-    def moved(self, state: SearchState, search: Any, count: int) -> SearchState:
-        """The state ``count`` steps later."""
-        return state.replace(search=search, done=state.done + count)
+    def advance(self, states: list[SearchState]) -> list[tuple[SearchState, Row]]:
+        count = min(self.config.chunk, self.total - self.done(states[0]))
+        return [
+            (state.replace(search=search, done=state.done + count), metrics)
+            for state, (search, metrics) in zip(states, self.search(states, count), strict=True)
+        ]
 
     def compared(self, controller: Controller) -> tuple[float, float]:
         """The official score of a candidate, and what it is compared by."""
@@ -170,7 +185,3 @@ class SearchStage(Stage[Controller, SearchState, Controller]):
     def rekey(self, state: SearchState, number: int) -> SearchState:
         key = jax.random.fold_in(state.search.key, number)
         return state.replace(search=state.search.replace(key=key))
-
-    def outcome(self, state: SearchState, best: Controller | None) -> Controller:
-        assert best is not None
-        return best

@@ -5,7 +5,7 @@ time and not by memory. Only final states leave it, and scores if asked for.
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -14,24 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from .controller import Controller, check_controller
-from .criteria import EPSILON, criteria, score_v2, upright
-from .errors import JaxpendError, choose
+from .criteria import EPSILON, HEIGHT, Criteria, criteria, score_v2, upright
+from .errors import JaxpendError
 from .plant import Plant
 from .pytree import Pytree, pytree
 from .rollout import final_state, rollout
 from .scenario import DT, DURATION, Scenario, check_values
-from .variations import VARIATIONS, vary
+from .variations import numbers, vary
 
 __all__ = [
-    "EPSILON",
-    "Outcome",
-    "Survey",
-    "compile_sweep",
-    "mildest_failure",
-    "survey",
-    "sweep",
-    "upright",
-]
+    "EPSILON", "Outcome", "Survey", "at_least_one", "compile_sweep", "mildest_failure", "survey",
+    "sweep", "upright",
+]  # fmt: skip
 
 
 @pytree
@@ -41,20 +35,19 @@ class Outcome(Pytree):
     x: jax.Array  # (n, 4) final state
     success: jax.Array  # (n,) bool, upright at the end
     diverged: jax.Array  # (n,) bool, not a number: a failure
-    score: jax.Array | None = None  # (n,) v2 score, 0 for a failure of its own rule
+    score: jax.Array | None = None  # (n,) v2 score; 0 where its own rule of success is not met
 
 
-@partial(jax.jit, static_argnames=("scored", "dt", "duration", "delay_slots"))
-def _run(scenarios, controller, keys, *, scored, dt, duration, delay_slots):
+@partial(jax.jit, static_argnames=("scoring", "height", "dt", "duration", "delay_slots"))
+def _run(scenarios, controller, keys, *, scoring, height, duration, **options):
     """One chunk."""
-    options = {"dt": dt, "duration": duration, "delay_slots": delay_slots}
 
     def one(scenario, key):
-        if not scored:
-            return final_state(scenario, controller, key, **options), None
-        run = rollout(scenario, controller, key, **options)
-        c = criteria(run.t, run.x, run.u, scenario.plant, t_final=duration)
-        return run.x[-1], score_v2(c)
+        if scoring is None:
+            return final_state(scenario, controller, key, duration=duration, **options), None
+        run = rollout(scenario, controller, key, duration=duration, **options)
+        c = criteria(run.t, run.x, run.u, scenario.plant, height=height, t_final=duration)
+        return run.x[-1], scoring(c)
 
     x, score = jax.vmap(one)(scenarios, keys)
     return Outcome(x, upright(x), ~jnp.all(jnp.isfinite(x), axis=-1), score)
@@ -77,21 +70,24 @@ def _chunks(scenarios: Scenario, keys: jax.Array, size: int) -> Iterator[tuple]:
         yield jax.tree.map(lambda leaf, at=index: leaf[at], (scenarios, keys))
 
 
+def at_least_one(**counts: int) -> None:
+    """Raise ``JaxpendError`` for a count below 1; it is known by its name."""
+    for name, count in counts.items():
+        if count < 1:
+            raise JaxpendError(f"{name} is {count}; it must be at least 1")
+
+
 def _plan(
-    scenarios: Scenario,
-    key: jax.Array,
-    scored: bool,
-    dt: float,
-    duration: float,
-    chunk: int | None,
-) -> tuple[Iterator[tuple], dict[str, Any]]:
-    """Pieces (scenarios, keys) for ``_run``, and its static arguments."""
+    scenarios, key, *, scored=False, scoring=score_v2, height=HEIGHT, dt=DT, duration=DURATION,
+    chunk=None,
+):  # fmt: skip
+    """Pieces (scenarios, keys) for ``_run``, and its static arguments; options as in ``sweep``."""
     size = (512 if scored else 4096) if chunk is None else chunk
-    if size < 1:
-        raise JaxpendError(f"chunk is {size}; it must be at least 1")
+    at_least_one(chunk=size)
     # The buffer is as long as the longest delay needs.
     longest = 0 if scenarios.delay is None else int(np.max(scenarios.delay))
-    static = {"scored": scored, "dt": dt, "duration": duration, "delay_slots": longest + 1}
+    static = {"dt": dt, "duration": duration, "delay_slots": longest + 1}
+    static |= {"scoring": scoring, "height": height} if scored else {"scoring": None, "height": 0}
     keys = jax.random.split(key, len(scenarios.plant.mass))
     return _chunks(_lean(scenarios), keys, size), static
 
@@ -102,6 +98,8 @@ def sweep(
     key: jax.Array,
     *,
     scored: bool = False,
+    scoring: Callable[[Criteria], jax.Array] = score_v2,
+    height: float = HEIGHT,
     dt: float = DT,
     duration: float = DURATION,
     chunk: int | None = None,
@@ -114,7 +112,8 @@ def sweep(
         scenarios: every leaf with a leading axis of n, as ``vary`` makes them.
         controller: one for all.
         key: split once per rollout, whatever the chunk, so chunking changes nothing.
-        scored: the v2 performance score as well, which keeps a chunk of trajectories in memory.
+        scored: the performance score as well, which keeps a chunk of trajectories in memory.
+        scoring, height: of that score, as in a ``Task``.
         dt, duration: s.
         chunk: rollouts at a time; by default 4096, or 512 when scored.
 
@@ -127,7 +126,10 @@ def sweep(
     """
     check_values(scenarios)
     check_controller(controller)
-    pieces, static = _plan(scenarios, key, scored, dt, duration, chunk)
+    pieces, static = _plan(
+        scenarios, key, scored=scored, scoring=scoring, height=height, dt=dt, duration=duration,
+        chunk=chunk,
+    )  # fmt: skip
     outcomes = [_run(piece, controller, keys, **static) for piece, keys in pieces]
     n = len(scenarios.plant.mass)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:n], *outcomes)
@@ -136,7 +138,7 @@ def sweep(
 def compile_sweep(
     scenarios: Scenario, controller: Controller, key: jax.Array, **options: Any
 ) -> None:
-    """Compile what ``sweep`` with the same arguments runs; ``options`` are all of its options."""
+    """Compile what ``sweep`` with the same arguments runs."""
     check_controller(controller)
     pieces, static = _plan(scenarios, key, **options)
     first, keys = next(pieces)
@@ -158,10 +160,6 @@ class Survey:
     success: np.ndarray  # fraction of the repetitions
     diverged: np.ndarray  # number of the repetitions
     score: np.ndarray | None  # mean v2 score of the repetitions
-
-
-def _numpy(values: Any) -> Any:
-    return None if values is None else np.asarray(values)
 
 
 def survey(
@@ -186,25 +184,20 @@ def survey(
     Raises:
         JaxpendError: as ``vary`` and ``sweep``, or fewer than one repetition.
     """
-    if repetitions < 1:
-        raise JaxpendError(f"repetitions is {repetitions}; it must be at least 1")
+    at_least_one(repetitions=repetitions)
     if not grid:
         raise JaxpendError("the grid is empty; give at least one imperfection and its values")
-    values = {
-        name: VARIATIONS[choose("variation", name, VARIATIONS)].numbers(name, given)
-        for name, given in grid.items()
-    }
+    values = {name: numbers(name, given) for name, given in grid.items()}
     points = np.meshgrid(*values.values(), np.arange(repetitions), indexing="ij")[:-1]
     changes = {name: p.ravel() for name, p in zip(values, points, strict=True)}
     draw_key, run_key = jax.random.split(key)
     outcome = _varied(scenario, controller, changes, draw_key, run_key, options)
-    shape = points[0].shape
-    success, diverged, score = map(_numpy, (outcome.success, outcome.diverged, outcome.score))
+    shape, score = points[0].shape, outcome.score
     return Survey(
         values=values,
-        success=success.reshape(shape).mean(axis=-1),
-        diverged=diverged.reshape(shape).sum(axis=-1),
-        score=None if score is None else score.reshape(shape).mean(axis=-1),
+        success=np.mean(outcome.success.reshape(shape), axis=-1),
+        diverged=np.sum(outcome.diverged.reshape(shape), axis=-1),
+        score=None if score is None else np.mean(score.reshape(shape), axis=-1),
     )
 
 
@@ -237,8 +230,7 @@ def mildest_failure(
     Raises:
         JaxpendError: as ``survey``, or fewer than one sample.
     """
-    if samples < 1:
-        raise JaxpendError(f"samples is {samples}; it must be at least 1")
+    at_least_one(samples=samples)
     if not ranges:
         raise JaxpendError("there are no ranges; give at least one imperfection and its ends")
     place_key, draw_key, run_key = jax.random.split(key, 3)

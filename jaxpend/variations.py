@@ -19,9 +19,11 @@ import numpy as np
 
 from .errors import JaxpendError, choose
 from .plant import Plant
-from .scenario import DT, Pulses, Scenario, delay_steps, random_pulses
+from .scenario import DT, Scenario, delay_steps, random_pulses
 
-__all__ = ["INERTIAL", "LONGEST_DELAY", "RANGES", "VARIATIONS", "Variation", "sample", "vary"]
+__all__ = [
+    "INERTIAL", "LONGEST_DELAY", "RANGES", "VARIATIONS", "Variation", "numbers", "sample", "vary",
+]  # fmt: skip
 
 # (batch of n scenarios in numpy arrays, n values, n keys) -> batch of scenarios
 Apply = Callable[[Scenario, np.ndarray, jax.Array], Scenario]
@@ -32,35 +34,18 @@ class Variation:
     """One thing that can be wrong, and how."""
 
     apply: Apply
+    field: str  # of a ``Scenario``, or of its plant, that it changes
     title: str
     unit: str
     least: float = -np.inf  # values below make no sense
     in_steps: bool = False  # seconds that the reference cuts off to whole steps
     draws: bool = False  # whether a run of it depends on a key
 
-    def numbers(self, name: str, values: Any) -> np.ndarray:
-        """The values (n,) in SI units. Raises ``JaxpendError`` for what makes no sense."""
-        try:
-            values = np.atleast_1d(np.asarray(values, float))
-        except (TypeError, ValueError):
-            raise JaxpendError(f"{name} is {values!r}; it must be numbers") from None
-        if values.ndim != 1 or not values.size:
-            shape = values.shape
-            raise JaxpendError(f"{name} has values of shape {shape}; give a list of some numbers")
-        for value in values[~(np.isfinite(values) & (values >= self.least))]:
-            rule = "finite" if not np.isfinite(value) else f"at least {self.least:g}"
-            raise JaxpendError(f"{name} is {value} {self.unit}; it must be {rule}".rstrip())
-        return values
 
-    def checked(self, name: str, values: Any, dt: float) -> np.ndarray:
-        """The values (n,) as ``apply`` takes them. Raises as ``numbers``."""
-        values = self.numbers(name, values)
-        if self.in_steps:
-            return np.array([delay_steps(value, dt)[0] for value in values])
-        return values
-
-
-def _plant(field: str, index: int | None = None, per: tuple[str, int] | None = None) -> Apply:
+def _plant(
+    title: str, unit: str, field: str, index: int | None = None, *,
+    per: tuple[str, int] | None = None, least: float = -np.inf,
+) -> Variation:  # fmt: skip
     """Set an entry of a plant's field to the value, or to the value over another entry."""
 
     def apply(scenario, values, keys):
@@ -72,10 +57,10 @@ def _plant(field: str, index: int | None = None, per: tuple[str, int] | None = N
         changed[... if index is None else (slice(None), index)] = values
         return scenario.replace(plant=plant.replace(**{field: changed}))
 
-    return apply
+    return Variation(apply, field, title, unit, least)
 
 
-def _noise(field: str, entries: list[int]) -> Apply:
+def _noise(title: str, unit: str, field: str, entries: list[int]) -> Variation:
     """Set entries of one of the (4,) standard deviations to the value, keeping the others."""
 
     def apply(scenario, values, keys):
@@ -84,7 +69,7 @@ def _noise(field: str, entries: list[int]) -> Apply:
         changed[:, entries] = values[:, None]
         return scenario.replace(**{field: changed})
 
-    return apply
+    return Variation(apply, field, title, unit, 0, draws=True)
 
 
 def _torque_noise(scenario, values, keys):
@@ -97,7 +82,7 @@ def _responsiveness(scenario, values, keys):
     return scenario.replace(responsiveness=values.astype(scenario.dtype))
 
 
-def _delay(lagging: list[int]) -> Apply:
+def _delay(title: str, lagging: list[int]) -> Variation:
     """Let some of the measured components lag by at least so many steps."""
 
     def apply(scenario, values, keys):
@@ -106,7 +91,7 @@ def _delay(lagging: list[int]) -> Apply:
             delay = np.maximum(delay, scenario.delay)
         return scenario.replace(delay=delay)
 
-    return apply
+    return Variation(apply, "delay", title, "s", 0, in_steps=True)
 
 
 _many_pulses = jax.jit(jax.vmap(random_pulses))
@@ -114,14 +99,13 @@ _many_pulses = jax.jit(jax.vmap(random_pulses))
 
 def _perturbation(scenario, values, keys):
     """A random series of pulses for each key, its amplitudes times the value."""
-    pulses = _many_pulses(keys)
-    pulses = jax.tree.map(lambda a: np.asarray(a, scenario.dtype), pulses)
+    pulses = jax.tree.map(lambda a: np.asarray(a, scenario.dtype), _many_pulses(keys))
     scale = values[:, None, None].astype(scenario.dtype)
     return scenario.replace(pulses=pulses.replace(amplitude=pulses.amplitude * scale))
 
 
-# How bad it gets on the v2 boards: the ends of every grid of the robustness benchmark. Those of
-# inertial parameters are factors of the nominal value.
+# The ends of the grids of the v2 boards' robustness benchmark. Those of inertial parameters are
+# factors of the nominal value.
 INERTIAL = (0.75, 1.25)
 RANGES: dict[str, tuple[float, float]] = {
     "Ir": (0.0, 1e-4),
@@ -137,35 +121,45 @@ LONGEST_DELAY = round(RANGES["delay"][1] / DT)  # steps
 
 
 VARIATIONS: dict[str, Variation] = {
-    "Ir": Variation(_plant("motor_inertia"), "motor inertia", "kg m²", 0),
-    "m1r1": Variation(_plant("com", 0, per=("mass", 0)), "m₁ r₁", "kg m"),
-    "I1": Variation(_plant("inertia", 0), "I₁", "kg m²"),
-    "b1": Variation(_plant("damping", 0), "damping 1", "N m s/rad"),
-    "cf1": Variation(_plant("coulomb_friction", 0), "friction 1", "N m"),
-    "m2r2": Variation(_plant("com", 1, per=("mass", 1)), "m₂ r₂", "kg m"),
-    "m2": Variation(_plant("mass", 1), "m₂", "kg", 0),
-    "I2": Variation(_plant("inertia", 1), "I₂", "kg m²"),
-    "b2": Variation(_plant("damping", 1), "damping 2", "N m s/rad"),
-    "cf2": Variation(_plant("coulomb_friction", 1), "friction 2", "N m"),
-    "m1": Variation(_plant("mass", 0), "m₁", "kg", 0),
-    "l1": Variation(_plant("length", 0), "l₁", "m", 0),
-    "l2": Variation(_plant("length", 1), "l₂", "m", 0),
-    "gravity": Variation(_plant("gravity"), "gravity", "m/s²"),
-    "velocity_noise": Variation(
-        _noise("measurement_noise", [2, 3]), "velocity noise", "rad/s", 0, draws=True
-    ),
-    "position_noise": Variation(
-        _noise("measurement_noise", [0, 1]), "position noise", "rad", 0, draws=True
-    ),
-    "process_noise": Variation(
-        _noise("process_noise", [0, 1, 2, 3]), "process noise", "rad, rad/s", 0, draws=True
-    ),
-    "torque_noise": Variation(_torque_noise, "torque noise", "N m", 0, draws=True),
-    "responsiveness": Variation(_responsiveness, "torque response", "", 0),
-    "delay": Variation(_delay([1, 1, 1, 1]), "delay", "s", 0, in_steps=True),
-    "velocity_delay": Variation(_delay([0, 0, 1, 1]), "velocity delay", "s", 0, in_steps=True),
-    "perturbation": Variation(_perturbation, "perturbation strength", "", 0, draws=True),
+    "Ir": _plant("motor inertia", "kg m²", "motor_inertia", least=0),
+    "m1r1": _plant("m₁ r₁", "kg m", "com", 0, per=("mass", 0)),
+    "I1": _plant("I₁", "kg m²", "inertia", 0),
+    "b1": _plant("damping 1", "N m s/rad", "damping", 0),
+    "cf1": _plant("friction 1", "N m", "coulomb_friction", 0),
+    "m2r2": _plant("m₂ r₂", "kg m", "com", 1, per=("mass", 1)),
+    "m2": _plant("m₂", "kg", "mass", 1, least=0),
+    "I2": _plant("I₂", "kg m²", "inertia", 1),
+    "b2": _plant("damping 2", "N m s/rad", "damping", 1),
+    "cf2": _plant("friction 2", "N m", "coulomb_friction", 1),
+    "m1": _plant("m₁", "kg", "mass", 0, least=0),
+    "l1": _plant("l₁", "m", "length", 0, least=0),
+    "l2": _plant("l₂", "m", "length", 1, least=0),
+    "gravity": _plant("gravity", "m/s²", "gravity"),
+    "velocity_noise": _noise("velocity noise", "rad/s", "measurement_noise", [2, 3]),
+    "position_noise": _noise("position noise", "rad", "measurement_noise", [0, 1]),
+    "process_noise": _noise("process noise", "rad, rad/s", "process_noise", [0, 1, 2, 3]),
+    "torque_noise": Variation(_torque_noise, "torque_noise", "torque noise", "N m", 0, draws=True),
+    "responsiveness": Variation(_responsiveness, "responsiveness", "torque response", "", 0),
+    "delay": _delay("delay", [1, 1, 1, 1]),
+    "velocity_delay": _delay("velocity delay", [0, 0, 1, 1]),
+    "perturbation": Variation(_perturbation, "pulses", "perturbation strength", "", 0, draws=True),
 }
+
+
+def numbers(name: str, values: Any) -> np.ndarray:
+    """Values (n,) of the variation ``name``. Raises ``JaxpendError`` for what makes no sense."""
+    kind = VARIATIONS[choose("variation", name, VARIATIONS)]
+    try:
+        values = np.atleast_1d(np.asarray(values, float))
+    except (TypeError, ValueError):
+        raise JaxpendError(f"{name} is {values!r}; it must be numbers") from None
+    if values.ndim != 1 or not values.size:
+        shape = values.shape
+        raise JaxpendError(f"{name} has values of shape {shape}; give a list of some numbers")
+    for value in values[~(np.isfinite(values) & (values >= kind.least))]:
+        rule = f"at least {kind.least:g}" if np.isfinite(value) else "finite"
+        raise JaxpendError(f"{name} is {value} {kind.unit}; it must be {rule}".rstrip())
+    return values
 
 
 def vary(
@@ -184,10 +178,7 @@ def vary(
     Raises:
         JaxpendError: an unknown name, values of different number, out of range or not finite.
     """
-    values = {
-        name: VARIATIONS[choose("variation", name, VARIATIONS)].checked(name, given, dt)
-        for name, given in changes.items()
-    }
+    values = {name: numbers(name, given) for name, given in changes.items()}
     sizes = {len(v) for v in values.values()}
     if not sizes:
         raise JaxpendError("there are no changes; give at least one imperfection and its values")
@@ -198,16 +189,14 @@ def vary(
     keys = jax.random.split(key, (n, len(values)))
     batch = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (n, *np.shape(leaf))), scenario)
     for number, (name, its_values) in enumerate(values.items()):
+        if VARIATIONS[name].in_steps:
+            its_values = np.array([delay_steps(value, dt)[0] for value in its_values])
         batch = VARIATIONS[name].apply(batch, its_values, keys[:, number])
     return batch
 
 
-# --- at random ------------------------------------------------------------------------------
-
-
 def _vary_plant(plant: Plant, which: jax.Array, amount: jax.Array) -> Plant:
     """The plant with parameter ``which`` of ten (none if negative) off by ``amount`` in [-1, 1]."""
-
     (_, motor_inertia), (_, damping), (_, friction) = (RANGES[n] for n in ("Ir", "b1", "cf1"))
     spread = INERTIAL[1] - 1
     coulomb = plant.coulomb_friction
@@ -216,9 +205,9 @@ def _vary_plant(plant: Plant, which: jax.Array, amount: jax.Array) -> Plant:
     def off(number, joint):
         return jnp.where(which == number, amount, 0.0) * (np.arange(2) == joint)
 
+    heavier_motor = jnp.where(which == 0, motor_inertia * (amount + 1) / 2, 0.0)
     return plant.replace(
-        motor_inertia=plant.motor_inertia
-        + jnp.where(which == 0, motor_inertia * (amount + 1) / 2, 0.0),
+        motor_inertia=plant.motor_inertia + heavier_motor,
         com=plant.com * (1 + spread * (off(1, 0) + off(5, 1))),
         inertia=plant.inertia * (1 + spread * (off(2, 0) + off(7, 1))),
         damping=plant.damping + damping * (off(3, 0) + off(8, 1)),
@@ -241,7 +230,7 @@ def sample(plant: Plant, key: jax.Array, share: float = 1.0) -> Scenario:
     amount = jax.random.uniform(key_amount, minval=-1.0, maxval=1.0)
     part = (amount + 1) / 2  # the same draw on [0, 1]
     slow, fast = RANGES["responsiveness"]
-    pulses: Pulses = random_pulses(key_pulses)
+    pulses = random_pulses(key_pulses)
     delay = jnp.where(kind == 4, jnp.round(part * LONGEST_DELAY), 0).astype(jnp.int32)
     noise = jnp.where(kind == 1, RANGES["velocity_noise"][1] * part, 0.0)
     torque_noise = jnp.where(kind == 2, RANGES["torque_noise"][1] * part, 0.0)

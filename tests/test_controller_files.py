@@ -147,6 +147,14 @@ def test_a_name_and_a_file_together(tmp_path):
     assert find_controller(None, name, TASK) is OWN
 
 
+def test_a_module_that_ends_the_program_is_one_sentence(tmp_path, monkeypatch):
+    (tmp_path / "module_that_exits.py").write_text("import sys\n\nsys.exit(3)\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with refused("SystemExit: 3 at ", start="cannot load module_that_exits:law as module:name"):
+        find_controller(None, "module_that_exits:law", TASK)
+
+
 def test_a_reference_alone_is_no_controller(tmp_path):
     reference = Reference(jnp.zeros((3, 4)), jnp.zeros(2), jnp.zeros((2, 5)))
     with pytest.raises(JaxpendError, match="Reference is no controller; a controller is a"):

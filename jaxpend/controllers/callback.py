@@ -32,11 +32,11 @@ class PythonLaw(Memoryless):
     def _call(self, t: np.ndarray, x: np.ndarray) -> np.ndarray:
         t, x = np.asarray(t), np.asarray(x)
         name = getattr(self.law, "__name__", "the law")
+        times, states = t.ravel(), x.reshape(-1, 4)
         try:
             if self.batched:
-                u = self.law(t.reshape(-1), x.reshape(-1, 4))
+                u = self.law(times, states)
             else:
-                times, states = t.ravel(), x.reshape(-1, 4)
                 u = [self.law(float(a), b) for a, b in zip(times, states, strict=True)]
             torque = np.asarray(u, x.dtype)
         except THEIRS as error:

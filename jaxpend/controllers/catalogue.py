@@ -12,7 +12,7 @@ from ..boards import Task
 from ..controller import Controller, OpenLoop, check_controller, check_robot
 from ..errors import THEIRS, JaxpendError, blame, choose
 from ..plant import Plant
-from ..trajopt.reference import load_reference
+from ..trajopt.reference import Reference, load_reference
 from .callback import PythonLaw
 from .energy import energy_shaping
 from .files import classes_of, load_controller, load_policy
@@ -28,47 +28,52 @@ from .tvlqr import tvlqr
 __all__ = ["CATALOGUE", "Entry", "build", "find_controller"]
 
 
+Make = Callable[[Plant, str], Controller]
+
+
 @dataclasses.dataclass(frozen=True)
 class Entry:
     """A way to make a controller for a plant and a robot."""
 
     title: str
-    make: Callable[[Plant, str], Controller]
+    make: Make
+
+
+def _network(plant: Plant, robot: str) -> Controller:
+    return network_in(load_policy(robot))
 
 
 def _open_loop(plant: Plant, robot: str) -> Controller:
     reference = load_reference(robot)
     torques = reference.both(reference.u[:, None])
-    # Half a step early, so that the sum of time steps need not hit a stamp exactly.
+    # Half a step early, so that rounding in the sum of time steps does not matter.
     return OpenLoop(reference.dt * (jnp.arange(reference.steps) - 0.5), torques)
+
+
+def _along(make: Callable[[Plant, Reference], Controller]) -> Make:
+    """Along the swing-up that ships with the package."""
+    return lambda plant, robot: make(plant, load_reference(robot))
+
+
+def _then_lqr(make: Make, fraction: float = 1.0) -> Make:
+    return lambda plant, robot: with_lqr(make(plant, robot), plant, robot, fraction=fraction)
+
+
+def _guarded(make: Make) -> Make:
+    return lambda plant, robot: guard(make(plant, robot), robot, plant)
 
 
 CATALOGUE: dict[str, Entry] = {
     "policy": Entry("Policy", lambda plant, robot: load_policy(robot)),
-    "policy_network": Entry(
-        "Policy, network alone", lambda plant, robot: network_in(load_policy(robot))
-    ),
-    "policy_lqr": Entry(
-        "Policy, network + LQR",
-        lambda plant, robot: with_lqr(network_in(load_policy(robot)), plant, robot),
-    ),
-    "tvlqr": Entry("TVLQR", lambda plant, robot: tvlqr(plant, load_reference(robot))),
-    "tvlqr_guarded": Entry(
-        "TVLQR, guarded",
-        lambda plant, robot: guard(tvlqr(plant, load_reference(robot)), robot, plant),
-    ),
-    "mpc": Entry("iLQR MPC", lambda plant, robot: tracking_mpc(plant, load_reference(robot))),
+    "policy_network": Entry("Policy, network alone", _network),
+    "policy_lqr": Entry("Policy, network + LQR", _then_lqr(_network)),
+    "tvlqr": Entry("TVLQR", _along(tvlqr)),
+    "tvlqr_guarded": Entry("TVLQR, guarded", _guarded(_along(tvlqr))),
+    "mpc": Entry("iLQR MPC", _along(tracking_mpc)),
     "mpc_free": Entry("iLQR MPC, free", free_mpc),
-    "riccati": Entry(
-        "iLQR Riccati gains", lambda plant, robot: riccati(plant, load_reference(robot))
-    ),
-    "open_loop_lqr": Entry(
-        "Open loop + LQR", lambda plant, robot: with_lqr(_open_loop(plant, robot), plant, robot)
-    ),
-    "energy_lqr": Entry(
-        "Energy shaping + LQR",
-        lambda plant, robot: with_lqr(energy_shaping(plant, robot), plant, robot, fraction=2.0),
-    ),
+    "riccati": Entry("iLQR Riccati gains", _along(riccati)),
+    "open_loop_lqr": Entry("Open loop + LQR", _then_lqr(_open_loop)),
+    "energy_lqr": Entry("Energy shaping + LQR", _then_lqr(energy_shaping, fraction=2.0)),
     "open_loop": Entry("Open loop", _open_loop),
     "pd": Entry("PD", pd),
     "lqr": Entry("LQR", lqr),
@@ -78,8 +83,7 @@ CATALOGUE: dict[str, Entry] = {
 def build(name: str, plant: Plant, robot: str) -> Controller:
     """The controller of that name, in the dtype of ``plant`` and of jax's default.
 
-    Raises:
-        JaxpendError: an unknown name; the message lists the known ones.
+    Raises ``JaxpendError`` for an unknown name; the message lists the known ones.
     """
     return CATALOGUE[choose("controller", name, CATALOGUE)].make(plant, robot)
 
@@ -90,8 +94,9 @@ def find_controller(policy: str | Path | None, controller: str | None, task: Tas
     Args:
         policy: a policy or controller file; None: the policy that ships with the package.
         controller: a name in the catalogue; or ``module:name``, a controller or a Python
-            function, looked for in the working directory too. With ``policy`` as well: that of
-            the catalogue around that policy, or a file of the classes of ``module:name``.
+            function, looked for in the working directory too. If ``policy`` is given too, the
+            controller of the catalogue is built around it, or the file that it names is loaded
+            with the classes of ``module:name``.
         task: gives the robot, and the nominal plant that a controller of the catalogue is for.
 
     Raises:

@@ -10,9 +10,9 @@ and ``v`` holds the joint near its upright angle while it feeds energy (J) into 
 
 Source: Spong, "The swing up control problem for the acrobot", 1995, and Fantoni, Lozano, Spong,
 "Energy based control of the pendubot", 2000. It circles through the top; a ``Hybrid`` with LQR
-catches it there. On a plant that is heavier than the model, or has friction, it falls short of
-the top for ever; with a ``surplus``, E* rises and falls in time, so that it comes by the top
-with the right energy whatever that is.
+catches it there. On a plant that is heavier than the model, or has friction, it never reaches the
+top; with a ``surplus`` the energy aimed at rises and falls, so that the pendulum passes the top
+again and again.
 """
 
 from typing import ClassVar
@@ -75,19 +75,14 @@ class EnergyShaping(Memoryless):
 
 
 def energy_shaping(
-    plant: Plant,
-    robot: str,
-    gains: tuple[float, ...] | None = None,
-    *,
-    surplus: float | None = None,
+    plant: Plant, robot: str, gains: tuple | None = None, *, surplus: float | None = None
 ) -> EnergyShaping:
     """Energy shaping for ``robot``; ``gains`` (kp, kd, ke1, ke2, cap, kick), default tuned ones.
 
     ``surplus`` (J) is as in ``EnergyShaping``. Raises ``JaxpendError`` for an unknown robot.
     """
     joint = active_joint(robot)
-    kp, kd, ke1, ke2, cap, kick = jnp.asarray(
-        GAINS[robot] if gains is None else gains, plant.mass.dtype
-    )
-    more = None if surplus is None else jnp.asarray(surplus, plant.mass.dtype)
-    return EnergyShaping(plant, kp, kd, jnp.stack([ke1, ke2]), cap, kick, joint, more)
+    dtype = plant.mass.dtype
+    kp, kd, *ke, cap, kick = jnp.asarray(GAINS[robot] if gains is None else gains, dtype)
+    more = None if surplus is None else jnp.asarray(surplus, dtype)
+    return EnergyShaping(plant, kp, kd, jnp.stack(ke), cap, kick, joint, more)

@@ -5,9 +5,7 @@ gives, are made from it, so that a file cannot run code.
 """
 
 import dataclasses
-import math
 from collections.abc import Iterable
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,7 @@ from ..controller import Controller, OpenLoop, Zero, check_controller, robot_of
 from ..errors import JaxpendError, choose
 from ..observation import Observation
 from ..plant import Plant
-from ..robots import ROBOTS
+from ..robots import ROBOTS, shipped
 from ..trajopt.ilqr import Solution
 from ..trajopt.reference import Reference
 from .energy import EnergyShaping
@@ -34,13 +32,8 @@ from .riccati import Riccati
 from .tvlqr import TVLQR
 
 __all__ = [
-    "classes_of",
-    "load_controller",
-    "load_policy",
-    "read_header",
-    "save_controller",
-    "save_policy",
-]
+    "classes_of", "load_controller", "load_policy", "read_header", "save_controller", "save_policy",
+]  # fmt: skip
 
 FORMAT = 1
 # What files of earlier versions call classes and fields.
@@ -60,9 +53,6 @@ def classes_of(value: Any) -> set[type]:
         return set()
     parts = (getattr(value, f.name) for f in dataclasses.fields(value))
     return {type(value)}.union(*map(classes_of, parts))
-
-
-# --- writing -------------------------------------------------------------------------------
 
 
 def _described(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
@@ -110,13 +100,9 @@ def save_policy(
 ) -> None:
     """``save_controller`` for a ``Policy``, or a controller with one in it, such as a ``Guarded``.
 
-    Raises:
-        JaxpendError: a controller with no policy in it; use ``save_controller``.
+    Raises ``JaxpendError`` for a controller with no policy in it; use ``save_controller``.
     """
     save_controller(path, policy, network_in(policy).robot, provenance)
-
-
-# --- reading -------------------------------------------------------------------------------
 
 
 def _made(tree: Any, arrays: dict[str, np.ndarray], classes: dict[str, type]) -> Any:
@@ -137,12 +123,10 @@ def _made(tree: Any, arrays: dict[str, np.ndarray], classes: dict[str, type]) ->
 
 def _first_format(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Policy:
     """A policy alone, as jaxpend 0.1 wrote it: arrays kernel0, bias0, ..."""
-    count = len(header["layers"]) - 1
+    layer = {name: jnp.asarray(values) for name, values in arrays.items()}
+    numbers = range(len(header["layers"]) - 1)
     policy = Policy(
-        layers=tuple(
-            (jnp.asarray(arrays[f"kernel{i}"]), jnp.asarray(arrays[f"bias{i}"]))
-            for i in range(count)
-        ),
+        layers=tuple((layer[f"kernel{i}"], layer[f"bias{i}"]) for i in numbers),
         torque_limit=jnp.asarray(header["torque_limit"], jnp.float32),
         robot=header["robot"],
         observation=Observation(**header["observation"]),
@@ -156,15 +140,14 @@ def _first_format(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poli
 
 
 def _check_policy(policy: Policy) -> None:
-    """Refuse a policy with values that no training could have left."""
+    """Refuse a policy with values that training cannot produce."""
     choose("robot", policy.robot, ROBOTS)
     choose("activation", policy.activation, ACTIVATIONS)
     if not isinstance(policy.observation, Observation):
         raise JaxpendError("the policy says nothing of its observation")
     period = policy.control_dt
-    if isinstance(period, bool) or not (
-        isinstance(period, int | float) and math.isfinite(period) and 0 < period <= SLOWEST
-    ):
+    is_number = isinstance(period, int | float) and not isinstance(period, bool)
+    if not (is_number and 0 < period <= SLOWEST):
         raise JaxpendError(f"the control period is {period} s; it must be in 0 to {SLOWEST:g} s")
     sizes = [kernel.shape[:1] + bias.shape for kernel, bias in policy.layers]
     fits = all(k.shape == size for (k, _), size in zip(policy.layers, sizes, strict=True))
@@ -176,17 +159,11 @@ def _check_policy(policy: Policy) -> None:
         raise JaxpendError("the policy holds values that are not finite or not positive")
 
 
-def _locate(robot_or_path: str | Path) -> Path:
-    if str(robot_or_path) not in ROBOTS:
-        return Path(robot_or_path)
-    return Path(str(resources.files("jaxpend").joinpath(f"policies/{robot_or_path}.npz")))
-
-
 def read_header(robot_or_path: str | Path) -> dict[str, Any]:
     """The JSON header of a policy or controller file. Raises as ``arrays.read_arrays``."""
-    path = _locate(robot_or_path)
+    path = shipped(robot_or_path, "policies")
     header, _ = read_arrays(path, "policy")
-    if header.get("robot") not in (*ROBOTS,) or not isinstance(header.get("provenance", {}), dict):
+    if header.get("robot") not in [*ROBOTS] or not isinstance(header.get("provenance", {}), dict):
         raise JaxpendError(f"{path} is not a policy file: its header does not say what it is of")
     return header
 
@@ -207,7 +184,7 @@ def load_controller(
         JaxpendError: no such file, not a controller file, one for the other robot, a class that
             is not known, or values that make no sense.
     """
-    path = _locate(robot_or_path)
+    path = shipped(robot_or_path, "policies")
     header, arrays = read_arrays(path, "policy")
     if header.get("format") != FORMAT:
         raise JaxpendError(f"{path} has policy format {header.get('format')}; this reads {FORMAT}")

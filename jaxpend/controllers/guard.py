@@ -1,4 +1,4 @@
-"""What a controller is wrapped in to survive a plant and sensors that are not the nominal ones.
+"""An observer and a rescue around a controller, for plants and sensors that are not nominal.
 
 An extended state observer (Han, "From PID to active disturbance rejection control", 2009) estimates
 state and disturbance from the measured *angles* and the applied torque, so that neither noise nor
@@ -11,9 +11,9 @@ does not explain. All three poles of the linear error lie at the bandwidth. On t
 the estimate is exact but for rounding.
 
 A swing-up that has failed is left to a rescue: a controller for which time does not matter, such
-as energy shaping with LQR at the top. It takes over for good: when the top is not reached in
-time, and at once when there is more energy than a swing-up needs, for a motor that goes on
-pushing then spins the arm faster than it can be stopped.
+as energy shaping with LQR at the top. It takes over when the top is not reached in time, or when
+there is more energy than a swing-up needs: a motor that goes on pushing would then spin the arm
+faster than it can be stopped. It keeps control until the end of the run.
 """
 
 from typing import Any, ClassVar
@@ -57,7 +57,7 @@ class Observer(Pytree):
         return jnp.array(False), jnp.zeros(4), jnp.zeros(2), jnp.zeros(2)
 
     def __call__(self, memory, measured: jax.Array):
-        """New memory and estimated state (4,), given a measurement (4,). The first is believed."""
+        """New memory and estimated state (4,), at first the measured one, of a measurement (4,)."""
         started, x, d, torque = memory
         ahead = rk4_step(self.plant, x, torque, self.dt)
         ahead = ahead + jnp.concatenate([0.5 * self.dt**2 * d, self.dt * d])
@@ -76,8 +76,7 @@ class Observer(Pytree):
 def observer(plant: Plant, bandwidth: float, *, dt: float = 0.002) -> Observer:
     """The observer of a plant with all error poles at ``bandwidth`` (rad/s), called every ``dt`` s.
 
-    Raises:
-        JaxpendError: bandwidth or dt is not positive.
+    Raises ``JaxpendError`` if bandwidth or dt is not positive.
     """
     if not (bandwidth > 0 and dt > 0):
         raise JaxpendError(f"bandwidth = {bandwidth} rad/s and dt = {dt} s must be positive")
@@ -101,7 +100,7 @@ class Rescue(Pytree):
     plant: Plant | None = None  # the model, for the energy
 
     def failed(self, t: jax.Array, x: jax.Array) -> jax.Array:
-        """Whether a state (4,) at time t is one that a swing-up that worked does not reach."""
+        """Whether a swing-up that works would not be in state ``x`` (4,) at time ``t`` (s)."""
         upright = jnp.array(UPRIGHT, x.dtype)
         away = jnp.max(jnp.abs(deviation(x, upright)[:2])) > self.radius
         failed = (t > self.after) & away

@@ -87,12 +87,7 @@ class Hybrid(Pytree):
 
 
 def with_lqr(
-    swingup: Controller,
-    plant: Plant,
-    robot: str,
-    *,
-    fraction: float = 1.0,
-    hysteresis: float = 4.0,
+    swingup: Controller, plant: Plant, robot: str, *, fraction: float = 1.0, hysteresis: float = 4.0
 ) -> Hybrid:
     """``swingup`` with LQR at the top, switched by the ellipsoid where LQR does not saturate.
 

@@ -6,7 +6,7 @@ with ``A, B`` the linearisation at ``x* = (pi, 0, 0, 0)``. The cost-to-go ``V = 
 region: the ellipsoid ``V <= level``. Angles are compared modulo one turn.
 """
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from ..plant import UPRIGHT, Plant, deviation, linearize
 from ..pytree import pytree
 from .search_space import FACTOR
 
-__all__ = ["DEFAULT_Q", "DEFAULT_R", "LQR", "delay_tolerant", "growth", "lqr"]
+__all__ = ["DEFAULT_Q", "DEFAULT_R", "LQR", "delay_tolerant", "in_float64", "lqr"]
 
 # Bryson's rule: 1 / (largest acceptable value)^2 of rad, rad, rad/s, rad/s.
 DEFAULT_Q = (1.0, 1.0, 0.1, 0.1)
@@ -48,18 +48,24 @@ class LQR(Memoryless):
         return carry, jnp.clip(torque, -self.torque_limit, self.torque_limit)
 
 
-def _upright(plant: Plant, joint: int) -> tuple[np.ndarray, np.ndarray]:
-    """A (4, 4) and B (4, 1) of the linearisation at upright, float64."""
-    with jax.enable_x64(True):
-        exact = jax.tree.map(lambda v: jnp.asarray(np.asarray(v), jnp.float64), plant)
-        a, b = (np.asarray(m) for m in linearize(exact, jnp.array(UPRIGHT), jnp.zeros(2)))
-    return a, b[:, joint : joint + 1]
+def in_float64(tree: Any) -> Any:
+    """A pytree with its arrays in float64, which has to be enabled."""
+    return jax.tree.map(lambda v: jnp.asarray(np.asarray(v), jnp.float64), tree)
 
 
-def _held(a: np.ndarray, b: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """The same for steps of ``dt`` with zero-order hold."""
+def _upright(plant: Plant, joint: int, dt: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """A (4, 4) and B (4, 1) of the linearisation at upright, float64.
+
+    With ``dt`` (s) those of steps of it, with zero-order hold.
+    """
     from scipy.linalg import expm
 
+    with jax.enable_x64(True):
+        linear = linearize(in_float64(plant), jnp.array(UPRIGHT), jnp.zeros(2))
+        a, b = (np.asarray(matrix) for matrix in linear)
+    b = b[:, joint : joint + 1]
+    if dt is None:
+        return a, b
     held = expm(dt * np.block([[a, b], [np.zeros((1, 5))]]))
     return held[:4, :4], held[:4, 4:]
 
@@ -91,36 +97,30 @@ def lqr(
     if weights.shape != (4,) or not (weights >= 0).all() or not r > 0 or not (dt is None or dt > 0):
         raise JaxpendError(f"LQR needs q of 4 values >= 0, r > 0 and dt > 0; got {q}, {r}, {dt}")
     dtype = jnp.result_type(plant.mass)
-    a, b = _upright(plant, joint)
+    a, b = _upright(plant, joint, dt)
     try:
         if dt is None:
             p = solve_continuous_are(a, b, np.diag(weights), r * np.eye(1))
             k = b.T @ p / r
         else:
-            a, b = _held(a, b, dt)
             p = solve_discrete_are(a, b, dt * np.diag(weights), dt * r * np.eye(1))
             k = b.T @ p @ a / (dt * r + b.T @ p @ b)
     except LinAlgError as error:
         raise JaxpendError(f"no LQR for this plant and these weights: {error}") from None
     gain = np.zeros((2, 4))
     gain[joint] = k[0]
-    return LQR(
-        gain=jnp.asarray(gain, dtype),
-        cost_to_go=jnp.asarray(p, dtype),
-        goal=jnp.asarray(UPRIGHT, dtype),
-        torque_limit=jnp.asarray(plant.torque_limit, dtype),
-    )
+    values = (gain, p, UPRIGHT, plant.torque_limit)
+    return LQR(*(jnp.asarray(value, dtype) for value in values))
 
 
-def growth(a: np.ndarray, b: np.ndarray, gain: np.ndarray, steps: int) -> float:
+def _growth(a: np.ndarray, b: np.ndarray, gain: np.ndarray, steps: int) -> float:
     """How fast the slowest mode of ``u_k = -gain x_(k - steps)`` grows, 1/step; negative: decays.
 
     ``a`` (4, 4) and ``b`` (4, 1) are of one step, ``gain`` is (4,). The delayed loop is linear in
     the state and the torques that are on their way.
     """
-    if not steps:
-        loop = a - b * gain
-    else:
+    loop = a - b * gain
+    if steps:
         loop = np.zeros((4 + steps, 4 + steps))
         loop[:4, :4], loop[:4, -1], loop[4, :4] = a, b[:, 0], -gain
         loop[5:, 4:-1] = np.eye(steps - 1)
@@ -134,8 +134,7 @@ def delay_tolerant(top: LQR, plant: Plant, delay: float, *, dt: float = 0.002) -
     without delay, with half of it and with all (Nelder-Mead from the LQR's gain, float64). The
     cost-to-go stays the LQR's, as a measure of how far away a state is.
 
-    Raises:
-        JaxpendError: delay or dt out of range, or no such gain was found.
+    Raises ``JaxpendError`` if delay or dt are out of range, or no such gain was found.
     """
     from scipy.optimize import minimize
 
@@ -143,9 +142,12 @@ def delay_tolerant(top: LQR, plant: Plant, delay: float, *, dt: float = 0.002) -
         raise JaxpendError(f"delay = {delay} s must not be negative, dt = {dt} s be positive")
     start, steps = np.asarray(top.gain, float), round(delay / dt)
     joint = int(np.abs(start).sum(axis=1).argmax())
-    a, b = _held(*_upright(plant, joint), dt)
-    gain_at = lambda z: start[joint] * (1 + z)  # noqa: E731
-    worst = lambda z: max(growth(a, b, gain_at(z), d) for d in {0, steps // 2, steps})  # noqa: E731
+    a, b = _upright(plant, joint, dt)
+
+    def worst(z):
+        gain = start[joint] * (1 + z)
+        return max(_growth(a, b, gain, delayed) for delayed in {0, steps // 2, steps})
+
     z = np.zeros(4)
     for size in (0.3, 0.3, 0.1, 0.1):  # anew, because its simplex shrinks too early
         simplex = z + size * np.vstack([np.zeros(4), np.eye(4)])
@@ -154,5 +156,5 @@ def delay_tolerant(top: LQR, plant: Plant, delay: float, *, dt: float = 0.002) -
     if worst(z) >= 0:
         raise JaxpendError(f"no gain was found that tolerates a delay of {delay} s")
     gain = np.zeros((2, 4))
-    gain[joint] = gain_at(z)
+    gain[joint] = start[joint] * (1 + z)
     return top.replace(gain=jnp.asarray(gain, top.gain.dtype))

@@ -7,7 +7,8 @@ is played with its gains. The cost, with ``e = x - x_ref``,
     sum dt (e' Q e + r (u - u_ref)^2) + s (u_k - u_{k-1} - change of u_ref)^2 + e_H' P e_H
 
 has as reference either a swing-up (then ``P`` is the tracking problem's own cost-to-go where
-the horizon ends, so that a short horizon is enough), or upright itself (it flies free).
+the horizon ends, so that a short horizon is enough), or upright itself (then the controller
+finds its own way up).
 """
 
 from functools import partial
@@ -35,33 +36,19 @@ STEP_SIZES = (1.0, 0.5, 0.2)
 GRID = 0.02
 
 
-@pytree
-class _Window(Pytree):
-    """The problem of one horizon: ``params`` of the ``ilqr.Problem``."""
-
-    plant: Plant
-    x_ref: jax.Array  # (H + 1, 4)
-    u_ref: jax.Array  # (H,)
-    q: jax.Array  # (4,) per second
-    r: jax.Array  # () per second
-    smoothness: jax.Array  # () s
-    p_end: jax.Array  # (4, 4)
-    joint: int = static()
-    dt: float = static()
-
-
-def _features(p: _Window, k, z, u):
+def _features(p: "MPC", k, z, u):
     error = z[:4] - p.x_ref[k]
     change = u - z[4] - (p.u_ref[k] - p.u_ref[jnp.maximum(k - 1, 0)])
     cost = p.dt * (error @ (p.q * error) + p.r * (u - p.u_ref[k]) ** 2)
     return (cost + p.smoothness * change**2)[None]
 
 
-def _final(p: _Window, z):
+def _final(p: "MPC", z):
     error = z[:4] - p.x_ref[-1]
-    return error @ p.p_end @ error
+    return error @ p.cost_to_go[-1] @ error
 
 
+# Of one horizon; its ``params`` are what ``MPC.window`` gives.
 PROBLEM = Problem(step=step, features=_features, final=_final, outer=lambda p, sums: sums[0])
 
 
@@ -89,14 +76,12 @@ class MPC(Pytree):
         last = self.u_ref.shape[0] - 1
         return jnp.where(k > last, 0.0, self.u_ref[jnp.minimum(k, last)])
 
-    def _window(self, k: jax.Array) -> _Window:
-        """The reference over the horizon that starts at its step ``k``."""
+    def window(self, k: jax.Array) -> "MPC":
+        """With the reference cut to the horizon that starts at its step ``k``."""
         ahead = k + np.arange(self.horizon + 1)
         rows = jnp.minimum(ahead, self.x_ref.shape[0] - 1)
-        return _Window(
-            self.plant, self.x_ref[rows], self._torque(ahead[:-1]), self.q, self.r, self.smoothness,
-            self.cost_to_go[rows[-1]], joint=self.joint, dt=self.dt,
-        )  # fmt: skip
+        x_ref, u_ref = self.x_ref[rows], self._torque(ahead[:-1])
+        return self.replace(x_ref=x_ref, u_ref=u_ref, cost_to_go=self.cost_to_go[rows[-1]][None])
 
     def reset(self, key: jax.Array) -> tuple[Solution, jax.Array]:
         """The first plan, and no torque applied yet."""
@@ -111,10 +96,10 @@ class MPC(Pytree):
         return plan.replace(z=z, u=u, gain=gain)
 
     def _recover(self, plan: Solution, k, x, x_ref) -> tuple[Solution, jax.Array]:
-        """The plan, and ``x`` on its turn; a plan that lost the state is dropped.
+        """The plan, and ``x`` with angles on the plan's turn; a plan far from ``x`` is dropped.
 
-        Angles are measured modulo a turn or not; the plan knows on which turn it is, and where it
-        is lost, the reference does.
+        Measured angles may be modulo a turn. The plan says on which turn they are, and where it
+        is dropped the reference.
         """
         lost = ~(jnp.max(jnp.abs(deviation(x, plan.z[0, :4])[:2])) < 0.5 * jnp.pi)
         expected = jnp.where(lost, x_ref, plan.z[0, :4])
@@ -128,7 +113,7 @@ class MPC(Pytree):
 
     def _optimise(self, plan: Solution, k, x, last) -> Solution:
         """The plan for the horizon from step ``k``, from the measured state ``x``."""
-        window = self._window(k)
+        window = self.window(k)
         limit = self.plant.torque_limit[self.joint]
         shifted = jax.tree.map(lambda a, b: jnp.where(k == 0, a, b), plan, self._shift(plan, k))
         shifted, x = self._recover(shifted, k, x, window.x_ref[0])
@@ -156,7 +141,8 @@ class MPC(Pytree):
         u = (1 - part) * plan.u[since] + part * plan.u[since + 1]
         error = jnp.append(deviation(x, z[:4]), jnp.where(on_grid, last - z[4], 0.0))
         limit = self.plant.torque_limit[self.joint]
-        # A plan that diverged has no torque to offer; zero keeps the rest of a batch clean.
+        # A plan that diverged has no torque, so it gives zero; NaN would spread to the rest of a
+        # batch.
         torque = jnp.nan_to_num(u + plan.gain[since] @ error)
         torque = jnp.clip(torque, -limit, limit).astype(last.dtype)
         return (plan, torque), jnp.where(np.arange(2) == self.joint, torque, 0.0)
@@ -175,31 +161,20 @@ def tracking_mpc(
 ) -> MPC:
     """MPC that stabilises a swing-up and then the top; ``horizon`` in steps of its ``dt``.
 
-    The other arguments are as in ``tvlqr`` and ``MPC``.
-
-    Raises:
-        JaxpendError: a horizon, ``every`` or ``iterations`` that do not fit, and as ``lqr``.
+    The other arguments are as in ``tvlqr`` and ``MPC``. Raises ``JaxpendError`` for a horizon,
+    ``every`` or ``iterations`` that do not fit, and as ``lqr``.
     """
     _check(horizon, every, iterations, reference.steps)
     gain, cost_to_go, top = along(plant, reference, q=q, r=r)
     dtype = reference.x.dtype
     z = jnp.column_stack([reference.x, jnp.concatenate([jnp.zeros(1, dtype), reference.u])])
     gain = jnp.pad(-gain, ((0, 0), (0, 1)))
-    return MPC(
-        plant=plant,
-        x_ref=jnp.concatenate([reference.x[:-1], reference.goal[None]]),
-        u_ref=reference.u,
-        cost_to_go=jnp.concatenate([cost_to_go, top.cost_to_go[None]]),
-        q=jnp.asarray(q, dtype),
-        r=jnp.asarray(r, dtype),
-        smoothness=jnp.asarray(smoothness, dtype),
-        first=_plan(z[: horizon + 1], reference.u[:horizon], gain[:horizon]),
-        joint=active_joint(reference.robot),
-        horizon=horizon,
-        dt=reference.dt,
-        every=every,
-        iterations=iterations,
-    )
+    x_ref = jnp.concatenate([reference.x[:-1], reference.goal[None]])
+    costs = jnp.concatenate([cost_to_go, top.cost_to_go[None]])
+    first = _plan(z[: horizon + 1], reference.u[:horizon], gain[:horizon])
+    timing = {"horizon": horizon, "dt": reference.dt, "every": every, "iterations": iterations}
+    followed = (x_ref, reference.u, costs)
+    return _mpc(plant, reference.robot, followed, (q, r, smoothness), first, **timing)
 
 
 def free_mpc(
@@ -221,32 +196,26 @@ def free_mpc(
 
     The plan from hanging is the best of ``starts`` random sinusoids (drawn from ``key``, default
     ``jax.random.key(0)``), each optimised for ``first_iterations``; the other arguments are as in
-    ``MPC``.
-
-    Raises:
-        JaxpendError: a horizon, ``every`` or ``iterations`` that do not fit, and as ``lqr``.
+    ``MPC``. Raises ``JaxpendError`` as ``tracking_mpc``.
     """
     _check(horizon, every, iterations, horizon)
     top = lqr(plant, robot, dt=dt)
     dtype = plant.mass.dtype
-    zeros = jnp.zeros((horizon, 5), dtype)
-    mpc = MPC(
-        plant=plant,
-        x_ref=top.goal[None],
-        u_ref=jnp.zeros(1, dtype),
-        cost_to_go=top.cost_to_go[None],
-        q=jnp.asarray(q, dtype),
-        r=jnp.asarray(r, dtype),
-        smoothness=jnp.asarray(smoothness, dtype),
-        first=_plan(jnp.zeros((horizon + 1, 5), dtype), zeros[:, 0], zeros),
-        joint=active_joint(robot),
-        horizon=horizon,
-        dt=dt,
-        every=every,
-        iterations=iterations,
-    )
+    zeros = jnp.zeros((horizon + 1, 5), dtype)
+    first = _plan(zeros, zeros[1:, 0], zeros[1:])
+    timing = {"horizon": horizon, "dt": dt, "every": every, "iterations": iterations}
+    upright = (top.goal[None], jnp.zeros(1, dtype), top.cost_to_go[None])
+    mpc = _mpc(plant, robot, upright, (q, r, smoothness), first, **timing)
     key = jax.random.key(0) if key is None else key
     return mpc.replace(first=_first_plan(mpc, key, starts, first_iterations))
+
+
+def _mpc(plant, robot, reference, weights, first, **timing) -> MPC:
+    """Of states, torques and costs-to-go to follow, and weights of state, torque and change."""
+    x_ref, u_ref, costs = reference
+    q, r, smoothness = (jnp.asarray(weight, x_ref.dtype) for weight in weights)
+    joint = active_joint(robot)
+    return MPC(plant, x_ref, u_ref, costs, q, r, smoothness, first, joint, **timing)
 
 
 def _plan(z: jax.Array, u: jax.Array, gain: jax.Array) -> Solution:
@@ -264,8 +233,8 @@ def _first_plan(mpc: MPC, key: jax.Array, starts: int, iterations: int) -> Solut
     u = size * jnp.sin(rate * mpc.dt * np.arange(mpc.horizon) + phase)
     z0 = jnp.zeros(5, mpc.x_ref.dtype)
     limit = mpc.plant.torque_limit[mpc.joint]
-    window = mpc._window(jnp.array(0))
-    optimise = lambda u: solve(PROBLEM, window, z0, u, limit, iterations=iterations)  # noqa: E731
+    window = mpc.window(jnp.array(0))
+    optimise = partial(solve, PROBLEM, window, z0, limit=limit, iterations=iterations)
     plans = jax.vmap(optimise)(u.astype(z0.dtype))
     return jax.tree.map(lambda v: v[jnp.argmin(plans.cost)], plans)
 

@@ -17,10 +17,7 @@ from .search_space import WEIGHT
 
 __all__ = ["ACTIVATIONS", "Memory", "Policy", "change_policies", "network_in", "policies_in"]
 
-FORMAT = 1
 ACTIVATIONS = {name: getattr(jax.nn, name) for name in config.ACTIVATIONS}
-
-
 FASTEST = 0.001  # s, the shortest time between calls at which a history still goes back far enough
 
 
@@ -105,9 +102,8 @@ class Policy(Pytree):
         action = jnp.tanh(pre)
         if memory is not None:
             memory = memory.after(t, x, action)
-        torque = self.torque_limit * action
-        on_joint = np.arange(2) == active_joint(self.robot)
-        return (key, memory), jnp.where(on_joint, torque, jnp.zeros_like(torque))
+        torque, driven = self.torque_limit * action, np.arange(2) == active_joint(self.robot)
+        return (key, memory), jnp.where(driven, torque, jnp.zeros_like(torque))
 
 
 def _is_policy(part: Any) -> bool:

@@ -2,8 +2,9 @@
 
     u_k = u*_k + K_k ((x, u_{k-1}) - (x*_k, u*_{k-1}))
 
-The gains are those of the optimised cost itself, so they correct only as far as the score gains
-by it: the feedback includes the last torque, because a change of torque costs smoothness.
+The gains are those of the optimised cost itself, so they correct a deviation only where that
+improves the score. The feedback includes the last torque, because a change of torque costs
+smoothness.
 """
 
 from typing import ClassVar
@@ -34,17 +35,14 @@ class Riccati(Pytree):
 
     def __call__(self, carry, t, x):
         """Last torque and torque (2,), N m: the step nearest to ``t``; past the end, the LQR's."""
-        reference = self.reference
-        index = reference.index(t)
-        k = jnp.clip(index, 0, reference.steps - 1)
+        reference, limit = self.reference, self.top.torque_limit
+        k, underway = reference.at(t)
         last = carry - reference.u[jnp.maximum(k - 1, 0)]
         error = jnp.append(deviation(x, reference.x[k]), last)
-        limit = self.top.torque_limit
-        following = jnp.clip(
-            reference.both(reference.u[k] + reference.gain[k] @ error), -limit, limit
-        )
+        torque = reference.u[k] + reference.gain[k] @ error
+        following = jnp.clip(reference.both(torque), -limit, limit)
         _, holding = self.top(None, t, x)
-        torque = jnp.where(index < reference.steps, following, holding)
+        torque = jnp.where(underway, following, holding)
         return jnp.sum(torque).astype(carry.dtype), torque
 
 

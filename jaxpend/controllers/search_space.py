@@ -1,7 +1,8 @@
-"""What of a controller is searched, as one vector.
+"""The parameters of a controller that are searched, as one vector.
 
-A class says it in ``SEARCHED``, by key path from itself: ``{"gain": FACTOR}``; its parts add what
-they say themselves. Three kinds of coordinates ``z``, so that parameters of any size are alike:
+A class names them in ``SEARCHED``, by key path from itself: ``{"gain": FACTOR}``; those that its
+parts name are added. There are three kinds of coordinates ``z``, so that a step of one size suits
+parameters of any size:
 
     WEIGHT     leaf = z                               of order 1 anyway: weights of a network
     FACTOR     leaf = start exp(z)                    z is a fraction; zeros and signs stay
@@ -25,7 +26,7 @@ __all__ = ["FACTOR", "KNOTS", "OVER_TIME", "WEIGHT", "coordinates", "kinds"]
 # What ``searched`` may be besides key paths.
 WHOLE = ("all", "weights", "hidden")
 WEIGHT, FACTOR, OVER_TIME = "weight", "factor", "over time"
-# Of ``OVER_TIME``, evenly spaced: a thousand independent gains would be searched in vain.
+# Of ``OVER_TIME``, evenly spaced, because a thousand independent gains are too many to search.
 KNOTS = 16
 
 
@@ -41,7 +42,8 @@ def _declared(part: Any, hidden: bool, prefix: str = "") -> dict[str, str]:
     return found
 
 
-def _named_leaves(controller: Any) -> tuple[dict[str, Any], Any]:
+def _named_leaves(controller):
+    """Key path -> leaf, and the structure."""
     found, structure = jax.tree_util.tree_flatten_with_path(controller)
     return {keystr(path, simple=True, separator="."): leaf for path, leaf in found}, structure
 
@@ -67,11 +69,10 @@ def kinds(controller: Any, searched: str = "all") -> dict[str, str]:
     leaves = [p for p, v in named.items() if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
     said = _declared(controller, searched == "hidden")
     declared = {p: kind for p in leaves for name, kind in said.items() if _is_under(p, name)}
-    names = [name.strip() for name in searched.split(",")]
     found = declared if searched in WHOLE else {}
     if searched == "weights":
         found = {path: kind for path, kind in declared.items() if kind == WEIGHT}
-    for name in () if searched in WHOLE else names:
+    for name in () if searched in WHOLE else map(str.strip, searched.split(",")):
         below = [p for p in leaves if _is_under(p, name)]
         if not below:
             known = ", ".join(leaves)
@@ -79,10 +80,8 @@ def kinds(controller: Any, searched: str = "all") -> dict[str, str]:
         here = {p: declared[p] for p in below if p in declared}
         found |= here or dict.fromkeys(below, FACTOR)
     if not found:
-        raise JaxpendError(
-            f"{type(controller).__name__} declares no searched parameters; name some of: "
-            f"{', '.join(leaves)}"
-        )
+        text = f"{type(controller).__name__} declares no searched parameters; name some of: "
+        raise JaxpendError(text + ", ".join(leaves))
     return {path: found[path] for path in leaves if path in found}
 
 
@@ -92,23 +91,20 @@ def _between_knots(steps: int) -> np.ndarray:
     return np.maximum(1 - np.abs(place[:, None] - np.arange(KNOTS)), 0)
 
 
-def coordinates(
-    controller: Any, searched: str = "all"
-) -> tuple[jax.Array, np.ndarray, Callable[[jax.Array], Any]]:
-    """Where a controller is (n,), which of that are weights (n,), and the way back.
+Rebuild = Callable[[jax.Array], Any]
 
-    The last one is the function from such vectors to controllers. Works under ``jax.jit``.
-    Arguments and errors as ``kinds``.
+
+def coordinates(controller: Any, searched: str = "all") -> tuple[jax.Array, np.ndarray, Rebuild]:
+    """The searched parameters as a vector (n,), which of them are weights (n,), and the function
+    from a vector to the controller. Works under ``jax.jit``. Arguments and errors as ``kinds``.
     """
     chosen = kinds(controller, searched)
     leaves, structure = _named_leaves(controller)
 
-    def place(path, kind):
-        leaf = jnp.asarray(leaves[path])
+    def place(leaf, kind):
         if kind == WEIGHT:
             return leaf
-        shape = (KNOTS, *leaf.shape[1:]) if kind == OVER_TIME else leaf.shape
-        return jnp.zeros(shape, leaf.dtype)
+        return jnp.zeros_like(leaf, shape=(KNOTS, *leaf.shape[1:]) if kind == OVER_TIME else None)
 
     def moved(leaf, kind, z):
         if kind == WEIGHT:
@@ -117,7 +113,7 @@ def coordinates(
             z = jnp.tensordot(jnp.asarray(_between_knots(leaf.shape[0]), z.dtype), z, 1)
         return leaf * jnp.exp(z)
 
-    places = [place(path, kind) for path, kind in chosen.items()]
+    places = [place(jnp.asarray(leaves[path]), kind) for path, kind in chosen.items()]
     flat, unravel = ravel_pytree(places)
     is_weight = [kind == WEIGHT for kind in chosen.values()]
     weights = np.repeat(is_weight, [np.size(z) for z in places])

@@ -17,11 +17,10 @@ from ..controller import Memoryless
 from ..plant import Plant, deviation, rk4_step
 from ..pytree import pytree
 from ..trajopt.reference import Reference
-from .lqr import DEFAULT_Q, DEFAULT_R, LQR, delay_tolerant, lqr
+from .lqr import DEFAULT_Q, DEFAULT_R, LQR, delay_tolerant, in_float64, lqr
 from .search_space import OVER_TIME
 
 __all__ = ["TVLQR", "along", "tvlqr"]
-
 
 ARRIVED = 0.1  # rad and rad/s, of every component around upright
 
@@ -37,14 +36,12 @@ class TVLQR(Memoryless):
 
     def __call__(self, carry, t, x):
         """Torque (2,), N m: the step nearest to ``t``; past the last one, the LQR's."""
-        reference = self.reference
-        index = reference.index(t)
-        k = jnp.clip(index, 0, reference.steps - 1)
+        reference, limit = self.reference, self.top.torque_limit
+        k, underway = reference.at(t)
         torque = reference.u[k] - self.gain[k] @ deviation(x, reference.x[k])
-        limit = self.top.torque_limit
         tracking = jnp.clip(reference.both(torque), -limit, limit)
         _, holding = self.top(None, t, x)
-        return carry, jnp.where(index < reference.steps, tracking, holding)
+        return carry, jnp.where(underway, tracking, holding)
 
 
 @jax.jit
@@ -76,23 +73,15 @@ def along(
     """
     dtype = reference.x.dtype
     with jax.enable_x64(True):
-        exact_plant, exact_nominal = jax.tree.map(
-            lambda v: jnp.asarray(np.asarray(v), jnp.float64), (plant, reference)
-        )
-        top = lqr(exact_plant, reference.robot, q=q, r=r, dt=reference.dt)
-        weights = jnp.asarray(np.asarray(q, float))
-        gain, cost_to_go = _riccati(exact_plant, exact_nominal, weights, r, top.cost_to_go)
+        exact = in_float64((plant, reference))
+        top = lqr(exact[0], reference.robot, q=q, r=r, dt=reference.dt)
+        gain, cost_to_go = _riccati(*exact, jnp.asarray(np.asarray(q, float)), r, top.cost_to_go)
         found = jax.tree.map(np.asarray, (gain, cost_to_go, top.replace(goal=reference.goal)))
     return jax.tree.map(lambda v: jnp.asarray(v, dtype), found)
 
 
 def tvlqr(
-    plant: Plant,
-    reference: Reference,
-    *,
-    q: tuple[float, ...] = DEFAULT_Q,
-    r: float = DEFAULT_R,
-    delay: float = 0.0,
+    plant: Plant, reference: Reference, *, q: tuple = DEFAULT_Q, r: float = DEFAULT_R, delay=0.0
 ) -> TVLQR:
     """TVLQR along ``reference``, solved in float64; the result has the dtype of ``reference``.
 

@@ -21,17 +21,9 @@ from ..plant import Plant
 from ..robots import ROBOTS, active_joint
 
 __all__ = [
-    "COMPETITION",
-    "ROBOTS",
-    "active_joint",
-    "available",
-    "competition",
-    "from_dict",
-    "from_file",
-    "load",
-    "parameters",
-    "read",
-]
+    "COMPETITION", "ROBOTS", "active_joint", "available", "competition", "from_dict", "from_file",
+    "load", "parameters", "read",
+]  # fmt: skip
 
 _REQUIRED = ("m1", "m2", "l1", "l2", "r1", "r2", "I1", "I2")
 _OPTIONAL = {
@@ -117,7 +109,7 @@ def read(path: str | Path) -> dict[str, float]:
     return {name: float(value) for name, value in parameters.items()}
 
 
-def from_file(path: str | Path, **kwargs) -> Plant:
+def from_file(path: str | Path, **kwargs: Any) -> Plant:
     """``from_dict`` on a YAML (or JSON) file. Raises ``JaxpendError`` if it cannot be read."""
     return from_dict(read(path), **kwargs)
 
@@ -131,21 +123,17 @@ def parameters(name: str) -> dict[str, float]:
     return _table()[design][model]
 
 
-def load(
-    design: str, model: str, *, robot: str | None = None, torque_limit: float | None = None
-) -> Plant:
-    """An identified parameter set by name, such as ``load("C.1", "1.0")``.
+def load(design: str, model: str, **kwargs: Any) -> Plant:
+    """``from_dict`` on an identified parameter set by name, such as ``load("C.1", "1.0")``.
 
-    ``robot`` and ``torque_limit`` are as in ``from_dict``. The arrays have jax's default float
-    type at the time of the call: float64 under ``jax.enable_x64``, else float32.
-
-    Raises:
-        JaxpendError: unknown design or model; the message lists the known ones.
+    The arrays have jax's default float type at the time of the call: float64 under
+    ``jax.enable_x64``, else float32. Raises ``JaxpendError`` for an unknown design or model; the
+    message lists the known ones.
     """
     table = _table()
     models = table[choose("design", str(design).removeprefix("design_"), table)]
     model = choose(f"model of design {design}", str(model).removeprefix("model_"), models)
-    return from_dict(models[model], robot=robot, torque_limit=torque_limit)
+    return from_dict(models[model], **kwargs)
 
 
 def competition(robot: str, torque_limit: float = 6.0) -> Plant:

@@ -6,7 +6,6 @@ taken for a checkpoint; the checksums of its zip format show what was damaged la
 """
 
 import contextlib
-import re
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +36,7 @@ class Checkpoints:
 
     def _numbered(self) -> list[Path]:
         """Files of checkpoints, whole or damaged, the newest first."""
-        if not self.folder.is_dir():
-            return []
-        own = re.compile(r"\d{6}\.npz", re.ASCII)
-        return sorted((p for p in self.folder.iterdir() if own.fullmatch(p.name)), reverse=True)
+        return sorted(self.folder.glob("[0-9]" * 6 + ".npz"), reverse=True)
 
     def save(self, tree: Any, about: dict[str, Any]) -> None:
         """Write the arrays of a pytree and a JSON object; then drop what is too old.
@@ -88,25 +84,21 @@ class Checkpoints:
 
     def clear(self) -> None:
         """Remove all of them: the run is finished."""
-        if self.folder.is_dir():
-            for path in self._numbered():
-                path.unlink()
-            remove_temporary(self.folder)
-            with contextlib.suppress(OSError):  # there are other files in it
-                self.folder.rmdir()
+        for path in self._numbered():
+            path.unlink()
+        remove_temporary(self.folder)
+        with contextlib.suppress(OSError):  # there are other files in it
+            self.folder.rmdir()
 
 
 def _rebuild(arrays: dict[str, np.ndarray], like: Any) -> Any:
-    """The pytree of a structure. Raises ``ValueError`` if the arrays are not those of it."""
-    leaves, structure = jax.tree_util.tree_flatten_with_path(like)
-    names = [jax.tree_util.keystr(path) for path, _ in leaves]
-    if arrays.keys() != set(names):
-        raise ValueError("it has other arrays")
-    values = [jnp.asarray(arrays[name]) for name in names]
-    return jax.tree.unflatten(
-        structure,
-        [
-            jax.random.wrap_key_data(value) if _is_key(leaf) else value
-            for value, (_, leaf) in zip(values, leaves, strict=True)
-        ],
-    )
+    """The pytree of a structure. Raises ``KeyError`` or ``ValueError`` for arrays of another."""
+
+    def filled(path, leaf):
+        value = jnp.asarray(arrays.pop(jax.tree_util.keystr(path)))
+        return jax.random.wrap_key_data(value) if _is_key(leaf) else value
+
+    tree = jax.tree_util.tree_map_with_path(filled, like)
+    if arrays:
+        raise ValueError("there are other arrays")
+    return tree

@@ -2,40 +2,30 @@
 
 import contextlib
 import fcntl
-import json
 import os
 import re
 import time
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from .. import __version__
-from . import tensorboard
-from ..config_files import differing_field, to_mapping
+from ..config_files import flat, to_mapping
+from ..controller import Controller
+from ..controllers.files import save_controller
 from ..errors import JaxpendError
 from ..files import TEMPORARY, remove_temporary, to_json, write_atomically
-from .reader import read_result, seed_folders
-
-if TYPE_CHECKING:
-    from ..controller import Controller
+from . import tensorboard
+from .reader import Unreadable, read_json, read_result, seed_folders
 
 __all__ = ["RunFolder", "refuse_foreign", "refuse_no_group"]
 
-
-def _field(values: Any, dotted: str) -> Any:
-    for name in dotted.split("."):
-        values = values.get(name) if isinstance(values, dict) else None
-    return values
-
-
-# Where a run is, and how it is kept, may change when it goes on; what it computes must not. The
-# plant is compared by its parameters.
+# Where a run is, and how it is kept, may change when it goes on; what it computes must not.
 MAY_DIFFER = (
     "run", "runs", "seeds", "vmap", "checkpoint", "on_divergence", "max_rollbacks", "tensorboard",
-    "plant", "design",
+    "design",
 )  # fmt: skip
 INSTEAD = "choose another name or remove the folder"
 
@@ -46,12 +36,11 @@ def refuse_foreign(path: Path) -> None:
         return
     # A process killed at the very beginning leaves no more than these.
     begun = {p for p in path.iterdir() if p.name == ".lock" or TEMPORARY.fullmatch(p.name)}
-    with contextlib.suppress(JaxpendError):  # not ours
-        if isinstance(_read(path / "run.json").get("stages"), list):
+    with contextlib.suppress(Unreadable):  # not ours
+        if isinstance(_object(path / "run.json").get("stages"), list):
             begun.add(path / "run.json")
     if set(path.iterdir()) - begun:
-        text = f"{path} is not empty and holds no run; choose another name"
-        raise JaxpendError(text)
+        raise JaxpendError(f"{path} is not empty and holds no run; choose another name")
 
 
 def refuse_no_group(path: Path) -> None:
@@ -63,36 +52,22 @@ def refuse_no_group(path: Path) -> None:
         raise JaxpendError(text)
 
 
-def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Fields of nested mappings, dotted, with their values."""
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
-
-
 def changed(config: Any) -> dict[str, list[Any]]:
     """Fields of a run's configuration, dotted, that are not as by default: value and default."""
     same = {"robot": config.robot} if hasattr(config, "robot") else {}
-    default, given = (dict(_flat(to_mapping(c))) for c in (type(config)(**same), config))
+    default, given = (flat(to_mapping(c)) for c in (type(config)(**same), config))
     return {k: [v, default.get(k)] for k, v in given.items() if k not in default or v != default[k]}
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """What a JSON file says; nothing if it is not there."""
-    try:
-        value = json.loads(path.read_text())
-    except FileNotFoundError:
-        return {}
-    except (ValueError, RecursionError):
-        value = None
+def _object(path: Path) -> dict[str, Any]:
+    """The JSON object in a file; an empty one if there is no such file."""
+    value = read_json(path) if path.exists() else {}
     if not isinstance(value, dict):
-        raise JaxpendError(f"{path} is damaged; {INSTEAD}")
+        raise Unreadable(path, "a JSON object")
     return value
 
 
-class RunFolder:
+class RunFolder(contextlib.AbstractContextManager):
     """Where a run leaves its configuration, metrics, policies and result.
 
     ``config.json``, ``run.json`` (version, command, what differs from the defaults, and what it is
@@ -131,23 +106,27 @@ class RunFolder:
             self.write_json("config.json", self.config)  # last: it says that a run is here
 
     def _check(self) -> None:
+        """Refuse a folder that is no run's, or that of another run."""
         refuse_foreign(self.path)
         if not (self.path / "config.json").exists():
             return
-        made_by = _read(self.path / "run.json")
-        stored = made_by.get("version", "(unknown version)")
-        if stored != __version__:
-            text = f"{self.path} holds a run of jaxpend {stored}, this is {__version__}; {INSTEAD}"
+        try:
+            made_by, config = _object(self.path / "run.json"), _object(self.path / "config.json")
+            read_result(self.path / "result.json")
+        except Unreadable as error:
+            raise JaxpendError(f"{error.path} is damaged; {INSTEAD}") from None
+        there = made_by.get("version", "(unknown version)")
+        if there != __version__:
+            text = f"{self.path} holds a run of jaxpend {there}, this is {__version__}; {INSTEAD}"
             raise JaxpendError(text)
-        stored, given = _read(self.path / "config.json"), self.config
-        field = differing_field(stored, given, MAY_DIFFER)
-        if field is None:
-            stored, given = ({"plant": about.get("plant")} for about in (made_by, self.about))
-            field = differing_field(stored, given)
-        if field is not None:
-            there, here = (to_json(_field(values, field)) for values in (stored, given))
-            text = f"{self.path} holds a run with {field} {there}, not {here}; {INSTEAD}"
-            raise JaxpendError(text)
+        # A plant is compared by its parameters, not by the name of its file.
+        stored = flat(config | {"plant": made_by.get("plant")})
+        given = flat(self.config | {"plant": self.about.get("plant")})
+        for field in given | stored:
+            there, here = stored.get(field), given.get(field)
+            if there != here and field.partition(".")[0] not in MAY_DIFFER:
+                text = f"{self.path} holds a run with {field} {to_json(there)}, not {to_json(here)}"
+                raise JaxpendError(f"{text}; {INSTEAD}")
 
     def _lock(self) -> None:
         # The system releases it when the process ends, however it ends.
@@ -167,20 +146,13 @@ class RunFolder:
         """Let other processes have the folder."""
         self._close()
 
-    def __enter__(self):
-        return self
-
     def __exit__(self, *exception):
         self.close()
 
     @property
     def result(self) -> dict | None:
         """What ``result.json`` says; None: the run is not finished."""
-        try:
-            return read_result(self.path / "result.json")
-        except JaxpendError:
-            text = f"{self.path / 'result.json'} is damaged; {INSTEAD}"
-            raise JaxpendError(text) from None
+        return read_result(self.path / "result.json")
 
     @property
     def seconds(self) -> float:
@@ -221,10 +193,8 @@ class RunFolder:
             columns = {stage["name"]: stage["column"] for stage in self.about.get("stages", ())}
             self._events = tensorboard.Events(self.path, columns)  # of all rows, this one too
 
-    def save(self, name: str, policy: "Controller", **provenance: Any) -> Path:
+    def save(self, name: str, policy: Controller, **provenance: Any) -> Path:
         """Write a policy or controller file with the command and configuration that made it."""
-        from ..controllers.files import save_controller  # loads jax; configurations do without
-
         made_by = {"command": self.command, "version": __version__, "config": self.config}
         save_controller(self.path / name, policy, self.config["robot"], provenance | made_by)
         return self.path / name

@@ -21,15 +21,9 @@ from ..errors import JaxpendError
 from ..robots import ROBOTS
 
 __all__ = [
-    "RunRecord",
-    "StageRecord",
-    "find",
-    "listing",
-    "read_result",
-    "read_run",
-    "remarks",
-    "seed_folders",
-]
+    "RunRecord", "StageRecord", "Unreadable", "find", "listing", "read_json", "read_result",
+    "read_rows", "read_run", "remarks", "seed_folders",
+]  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +51,8 @@ class RunRecord:
     rows: list[dict[str, Any]]  # of metrics.jsonl, numbers only, in the order of the stages
     result: dict[str, Any] | None  # None: not finished
     policy: str | None  # path, or robot for what ships with the package; None: none yet
-    made_by: dict[str, Any] = dataclasses.field(default_factory=dict)  # see ``_made_by``
+    # Texts (command, version), the ``plant``, and what is ``changed``: name -> value, default.
+    made_by: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def progress(self) -> dict[str, tuple[int, int]]:
@@ -69,36 +64,41 @@ class RunRecord:
         return done
 
     @property
-    def headings(self) -> dict[str, str]:
-        """Part of the result -> its heading: of what the run started from, and of its stages."""
-        return {"start": "start"} | {s.name: s.heading for s in self.stages if s.heading}
-
-    @property
     def results(self) -> dict[str, dict[str, Any]]:
-        """Heading -> official result."""
+        """Heading -> official result of what the run started from, and of its stages."""
+        headings = {"start": "start"} | {s.name: s.heading for s in self.stages if s.heading}
         result = self.result or {}
-        return {title: result[name] for name, title in self.headings.items() if name in result}
+        return {title: result[name] for name, title in headings.items() if name in result}
 
 
 # --- from files to values of the right types -----------------------------------------------
 
 
-class _Unreadable(JaxpendError):
+class Unreadable(JaxpendError):
     """A file of a run that is not what it should be."""
 
     def __init__(self, path: Path, what: str):
         super().__init__(f"{path} is not {what}; the run cannot be read")
-        self.file = path.name
+        self.path = path
 
 
-def _json(path: Path) -> Any:
-    """What a file says; None: there is no such file."""
+def read_json(path: Path) -> Any:
+    """What a file says; None: there is no such file. Raises ``Unreadable``."""
     try:
         return json.loads(path.read_text())
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError, RecursionError):
-        raise _Unreadable(path, "valid JSON") from None
+        raise Unreadable(path, "valid JSON") from None
+
+
+# Shapes of what files say, for ``_has``.
+CHART = (str, {...: str}, str, bool)
+STAGE = {
+    "name": str, "title": str, "unit": str, "column": str, "total": float, "heading": str,
+    "charts": [CHART], "scores": [str],
+}  # fmt: skip
+SAID = {"stages": [STAGE], "plant": {...: float}, "changed": {...: (object, object)}}
 
 
 def _number(value: Any) -> bool:
@@ -107,58 +107,53 @@ def _number(value: Any) -> bool:
     return is_number and abs(value) < 1e300  # which NaN is not
 
 
-def _is(value: Any, *kinds: type) -> Any:
-    """The value, if it is of one of the types. Raises ``TypeError`` else."""
-    if not isinstance(value, kinds):
-        raise TypeError
-    return value
+def _has(shape: Any, value: Any) -> bool:
+    """Whether a value of JSON has a shape.
+
+    It is a type (``float``: whatever is a ``_number``), ``[of all items]``, ``(of each item,)``,
+    ``{name: of this value}`` or ``{...: of all values}``.
+    """
+    if isinstance(shape, list):
+        return isinstance(value, list) and all(_has(shape[0], item) for item in value)
+    if isinstance(shape, tuple):
+        return isinstance(value, list) and len(value) == len(shape) and all(map(_has, shape, value))
+    if isinstance(shape, dict):
+        if not isinstance(value, dict):
+            return False
+        parts = dict.fromkeys(value, shape[...]) if ... in shape else shape
+        return all(_has(part, value.get(name)) for name, part in parts.items())
+    return _number(value) if shape is float else isinstance(value, shape)
 
 
 def _config(folder: Path) -> dict[str, Any]:
     path = folder / "config.json"
-    config = _json(path)
+    config = read_json(path)
     if not isinstance(config, dict) or config.get("robot") not in list(ROBOTS):
-        raise _Unreadable(path, "the configuration of a run")
+        raise Unreadable(path, "the configuration of a run")
     return config
 
 
 def read_result(path: Path) -> dict[str, Any] | None:
-    """What ``result.json`` says; None: the run is not finished.
+    """What ``result.json`` says; None: the run is not finished. Raises ``Unreadable``."""
 
-    Raises:
-        JaxpendError: it is not the result of a run.
-    """
-    result = _json(path)
+    def sound(part):
+        fits = _has({"score": float}, part) and _number(part.get("seconds") or 0)
+        up = {"criteria": {"swingup_time": float}}
+        return fits and (not part.get("success") or _has(up, part))
+
+    result = read_json(path)
     if result is None and not path.exists():
         return None
-    try:
-        parts = {k: v for k, v in _is(result, dict).items() if k not in ("robot", "seed", "score")}
-        sound = _number(result["score"])
-        for part in parts.values():
-            sound &= _number(_is(part, dict)["score"]) and _number(part.get("seconds") or 0)
-            if part.get("success"):
-                sound &= _number(_is(part["criteria"], dict)["swingup_time"])
-        if sound:
-            return result
-    except (TypeError, KeyError):
-        pass
-    raise _Unreadable(path, "the result of a run")
+    whole = _has({"score": float}, result)
+    if whole and all(sound(result[k]) for k in result.keys() - {"robot", "seed", "score"}):
+        return result
+    raise Unreadable(path, "the result of a run")
 
 
-def _chart(value: Any) -> tuple[str, dict[str, str], str, bool]:
-    title, curves, ylabel, log = _is(value, list)
-    curves = {label: _is(column, str) for label, column in _is(curves, dict).items()}
-    return _is(title, str), curves, _is(ylabel, str), _is(log, bool)
-
-
-def _stage(value: Any) -> StageRecord:
-    """A stage as ``run.json`` has it. Raises TypeError, KeyError or ValueError."""
-    texts = {name: _is(value[name], str) for name in ("name", "title", "unit", "column", "heading")}
-    if not _number(value["total"]):
-        raise TypeError
-    charts = tuple(_chart(chart) for chart in _is(value["charts"], list))
-    scores = tuple(_is(column, str) for column in _is(value["scores"], list))
-    return StageRecord(total=value["total"], charts=charts, scores=scores, **texts)
+def _stage(said: Mapping[str, Any]) -> StageRecord:
+    values = {name: said[name] for name in STAGE}
+    values |= {"charts": tuple(map(tuple, said["charts"])), "scores": tuple(said["scores"])}
+    return StageRecord(**values)
 
 
 def _guessed(config: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> list[StageRecord]:
@@ -189,7 +184,7 @@ def _guessed(config: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> li
     return stages
 
 
-def _rows(path: Path) -> list[dict[str, Any]]:
+def read_rows(path: Path) -> list[dict[str, Any]]:
     """Rows of metrics with their numbers; what a crash cut off, and what is no row, is left out."""
     rows = []
     try:
@@ -204,27 +199,14 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _made_by(said: Any) -> dict[str, Any]:
-    """Texts (command, version), the ``plant``, and what is ``changed``: name -> value, default."""
-    plant, changed = (_is(_is(said, dict).get(k, {}), dict) for k in ("plant", "changed"))
-    if not all(map(_number, plant.values())) or any(len(pair) != 2 for pair in changed.values()):
-        raise TypeError
-    return {k: v for k, v in said.items() if isinstance(v, str) or k in ("plant", "changed")}
-
-
 def read_run(folder: Path) -> RunRecord:
-    """A run folder.
-
-    Raises:
-        JaxpendError: a file in it is not what it should be.
-    """
-    config, rows, path = _config(folder), _rows(folder / "metrics.jsonl"), folder / "run.json"
-    said = {} if (said := _json(path)) is None else said
-    try:
-        made_by, told = _made_by(said), said.get("stages")
-        stages = _guessed(config, rows) if told is None else [_stage(s) for s in _is(told, list)]
-    except (TypeError, KeyError, ValueError):
-        raise _Unreadable(path, "what a run says of itself") from None
+    """A run folder. Raises ``Unreadable`` for a file in it that is not what it should be."""
+    config, rows, path = _config(folder), read_rows(folder / "metrics.jsonl"), folder / "run.json"
+    said = {} if (said := read_json(path)) is None else said
+    blank: dict[str, Any] = {"stages": [], "plant": {}, "changed": {}}
+    if not (isinstance(said, dict) and _has(SAID, blank | said)):
+        raise Unreadable(path, "what a run says of itself")
+    stages = list(map(_stage, said["stages"])) if "stages" in said else _guessed(config, rows)
     order = {stage.name: (k, stage.column) for k, stage in enumerate(stages)}
     once = {}  # a row that came twice counts once
     for row in rows:
@@ -240,7 +222,7 @@ def read_run(folder: Path) -> RunRecord:
         rows=[once[key] for key in sorted(once)],
         result=read_result(folder / "result.json"),
         policy=next((str(folder / n) for n in policies if (folder / n).exists()), None),
-        made_by=made_by,
+        made_by={k: v for k, v in said.items() if isinstance(v, str) or k in ("plant", "changed")},
     )
 
 
@@ -276,12 +258,12 @@ def remarks(runs: Sequence[RunRecord]) -> list[str]:
     sentences = []
     for run in runs:
         if run.config and run.result is None:
-            where = ", ".join(
-                f"{stage.title} is at {done:,} of {total:,} {stage.unit}"
-                for stage, (done, total) in zip(run.stages, run.progress.values(), strict=True)
-            )
-            diverged = any(row.get("finite") == 0 for row in run.rows)
-            sentences.append(f"{run.name} is not finished{' and diverged' * diverged}: {where}.")
+            done = run.progress
+            at = [
+                f"{s.title} is at {done[s.name][0]:,} of {s.total:,} {s.unit}" for s in run.stages
+            ]
+            diverged = " and diverged" * any(row.get("finite") == 0 for row in run.rows)
+            sentences.append(f"{run.name} is not finished{diverged}: {', '.join(at)}.")
         if back := max((row.get("rollbacks", 0) for row in run.rows), default=0):
             text = f"{run.name} diverged and went back to its last good state {back} time"
             sentences.append(f"{text}{'s' * (back > 1)}.")
@@ -304,28 +286,29 @@ def _locked(folder: Path) -> bool:
 
 def _changed(folder: Path) -> str:
     """When a file in it was last written, as ISO 8601."""
-    times = [folder.stat().st_mtime]
+    times = []
     with contextlib.suppress(OSError):
         for path in folder.iterdir():
             with contextlib.suppress(OSError):  # it is gone already
                 times.append(path.lstat().st_mtime)
-    newest = max(times[1:], default=times[0])
+    newest = max(times, default=folder.stat().st_mtime)
     return datetime.datetime.fromtimestamp(newest).astimezone().isoformat(timespec="seconds")
 
 
 def _entry(folder: Path) -> dict[str, Any]:
     """One run folder as plain values; ``state`` is finished, running, interrupted or broken."""
-    about: dict[str, Any] = {"run": folder.name, "robot": None, "stages": [], "seed": None, "state": "broken"}
-    about |= {"at": None, "score": None, "seconds": None, "changed": _changed(folder)}
+    about: dict[str, Any] = {"run": folder.name, "robot": None, "stages": [], "seed": None}
+    about |= {"state": "broken", "at": None, "score": None, "seconds": None}
+    about["changed"] = _changed(folder)
     try:
         config = _config(folder)
         seed = config.get("seed")
         about |= {"robot": config["robot"], "seed": seed if isinstance(seed, int) else None}
         run = read_run(folder)
-    except _Unreadable as error:
-        return about | {"at": error.file}
-    about["stages"] = [stage.name for stage in run.stages if stage.heading]
+    except Unreadable as error:
+        return about | {"at": error.path.name}
     last = run.rows[-1] if run.rows else {}
+    about["stages"] = [stage.name for stage in run.stages if stage.heading]
     about["seconds"] = last.get("seconds")
     if run.result is not None:
         return about | {"state": "finished", "score": run.result["score"]}
@@ -340,10 +323,8 @@ def _group(folder: Path) -> dict[str, Any]:
     scores = [run["score"] for run in runs if run["score"] is not None]
     states = [run["state"] for run in runs]
     worst = next(s for s in ("broken", "running", "interrupted", "finished") if s in states)
-    return {
+    return runs[0] | {
         "run": folder.name,
-        "robot": runs[0]["robot"],
-        "stages": runs[0]["stages"],
         "seed": [run["seed"] for run in runs],
         "state": worst,
         "at": None if worst == "finished" else f"{states.count('finished')} of {len(runs)} seeds",

@@ -19,50 +19,36 @@ def interquartile_mean(values: ArrayLike) -> np.ndarray:
     return trim_mean(np.asarray(values, float), 0.25, axis=0)
 
 
-def interval(
-    values: ArrayLike, level: float = 0.95, resamples: int = 2000, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Percentile bootstrap interval of the interquartile mean over seeds.
+def interval(values: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Ends (...) of the 95 % percentile bootstrap interval of the interquartile mean over seeds.
 
-    Args:
-        values: (seeds, ...); the seeds are drawn again together, whatever follows.
-        level: of confidence.
-        resamples: drawn with replacement, by numpy's generator from ``seed``.
-
-    Returns:
-        Lower and upper ends, each (...).
+    ``values`` are (seeds, ...); the seeds are drawn again together, whatever follows, 2,000 times.
     """
     values = np.asarray(values, float)
-    rows = np.random.default_rng(seed).integers(len(values), size=(resamples, len(values)))
-    means = interquartile_mean(np.moveaxis(values[rows], 1, 0))
-    tail = (1 - level) / 2
-    return np.quantile(means, tail, axis=0), np.quantile(means, 1 - tail, axis=0)
-
-
-def _aggregate(scores: Sequence[float]) -> dict[str, Any]:
-    """The numbers of one stage; there is no interval of one seed."""
-    return {
-        "scores": list(scores),
-        "median": float(np.median(scores)),
-        "interquartile_mean": float(interquartile_mean(scores)),
-        "interval": np.array(interval(scores)).tolist() if len(scores) > 1 else None,
-        "lowest": min(scores),
-        "highest": max(scores),
-    }
+    rows = np.random.default_rng(0).integers(len(values), size=(2000, len(values)))
+    low, high = np.quantile(interquartile_mean(values[rows].swapaxes(0, 1)), (0.025, 0.975), axis=0)
+    return low, high
 
 
 def summary(results: Sequence[Mapping[str, Any]], headings: Mapping[str, str]) -> dict[str, Any]:
     """Results of the seeds of one robot as one: the scores and their statistics, a stage each.
 
-    ``headings`` are of the parts of a result, by name. ``interval`` is the 95 % bootstrap interval
-    of the interquartile mean.
+    ``headings`` are of the parts of a result, by name. ``interval`` is that of the interquartile
+    mean; there is none of one seed.
     """
-    return {
-        "robot": results[0]["robot"],
-        "seeds": [result["seed"] for result in results],
-        "stages": {
-            name: {"heading": heading} | _aggregate([result[name]["score"] for result in results])
-            for name, heading in headings.items()
-            if all(name in result for result in results)
-        },
-    }
+    stages = {}
+    for name, heading in headings.items():
+        if not all(name in result for result in results):
+            continue
+        scores = [result[name]["score"] for result in results]
+        stages[name] = {
+            "heading": heading,
+            "scores": scores,
+            "median": float(np.median(scores)),
+            "interquartile_mean": float(interquartile_mean(scores)),
+            "interval": np.array(interval(scores)).tolist() if len(scores) > 1 else None,
+            "lowest": min(scores),
+            "highest": max(scores),
+        }
+    seeds = [result["seed"] for result in results]
+    return {"robot": results[0]["robot"], "seeds": seeds, "stages": stages}

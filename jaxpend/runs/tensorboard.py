@@ -1,7 +1,6 @@
 """The metrics of a run as TensorBoard events; needs the package tensorboardX."""
 
 import contextlib
-import json
 import time
 import weakref
 from collections.abc import Mapping
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import JaxpendError
+from .reader import read_rows
 
 __all__ = ["Events", "require"]
 
@@ -45,9 +45,9 @@ class Events:
             path.unlink()
         self._writer = EventsWriter(str(folder / "events"), SUFFIX)
         weakref.finalize(self, self._writer.close)
-        for line in (run / "metrics.jsonl").read_text().splitlines():
-            with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError):  # no row
-                self.add(json.loads(line))
+        for row in read_rows(run / "metrics.jsonl"):
+            with contextlib.suppress(KeyError):  # of no stage
+                self.add(row)
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Write one row of metrics; what is not a number is left out."""

@@ -10,12 +10,11 @@ from ..config import Run, SACConfig
 from ..controller import Controller
 from ..pytree import Pytree, pytree
 from ..score import nominal
-from ..stage import Chart, Stage
+from ..stage import Candidates, Chart, Row, Stage
 from . import algorithm
 from .algorithm import Agent, SACState
-from .demonstrations import Imitation as Learner
 
-__all__ = ["SAC", "Imitation", "ImitationState"]
+__all__ = ["SAC", "Imitation", "ImitationState", "chunk_length"]
 
 
 @pytree
@@ -23,7 +22,7 @@ class ImitationState(Pytree):
     """SAC before its first step, and the actor that imitates."""
 
     sac: SACState
-    learner: Learner
+    learner: Any  # demonstrations.Imitation
 
 
 class Imitation(Stage[None, ImitationState, SACState]):
@@ -42,23 +41,15 @@ class Imitation(Stage[None, ImitationState, SACState]):
         return cls(config, task) if config and config.demonstrations.episodes else None
 
     def start(self, seed: int, before: None) -> ImitationState:
-        return self._state(*algorithm.begin(self.agent, jax.random.key(seed)))
+        return ImitationState(*algorithm.begin(self.agent, jax.random.key(seed)))
 
     def like(self) -> ImitationState:
-        return self._state(*algorithm.structure(self.agent))
-
-    @staticmethod
-    def _state(state: SACState, learner: Learner | None) -> ImitationState:
-        assert learner is not None  # there are demonstrations: ``of``
-        return ImitationState(state, learner)
-
-    def policy_like(self) -> Controller | None:
-        return None
+        return ImitationState(*algorithm.structure(self.agent))
 
     def done(self, state: ImitationState) -> int:
         return int(state.learner.done)
 
-    def advance(self, states: list[ImitationState]) -> list[tuple[ImitationState, dict[str, Any]]]:
+    def advance(self, states: list[ImitationState]) -> list[tuple[ImitationState, Row]]:
         count = min(self.CHUNK, self.total - self.done(states[0]))
         after = []
         for state in states:
@@ -66,12 +57,10 @@ class Imitation(Stage[None, ImitationState, SACState]):
             after.append((state.replace(learner=learner), {"loss": loss}))
         return after
 
-    def judge(
-        self, state: ImitationState, metrics: dict[str, Any]
-    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
+    def judge(self, state: ImitationState, metrics: Row) -> tuple[Row, Candidates]:
         return metrics, []
 
-    def note(self, row: dict[str, Any]) -> str:
+    def note(self, row: Row) -> str:
         return f"loss {float(row['loss']):.5f}"
 
     def watched(self, state: ImitationState) -> Any:
@@ -81,8 +70,17 @@ class Imitation(Stage[None, ImitationState, SACState]):
         key = jax.random.fold_in(state.learner.key, number)
         return state.replace(learner=state.learner.replace(key=key))
 
-    def outcome(self, state: ImitationState, best: Controller | None) -> SACState:
+    def outcome(self, state: ImitationState, best: None) -> SACState:
         return state.sac.replace(actor=state.learner.params)
+
+
+def chunk_length(total: int, most: int) -> int:
+    """The longest chunk of at most ``most`` steps that divides ``total``, for one compilation.
+
+    If that is less than half as long as it may be, ``most``: then the last chunk is shorter.
+    """
+    fitting = [length for length in range(most // 2 + 1, most + 1) if total % length == 0]
+    return fitting[-1] if fitting else most
 
 
 class SAC(Stage[SACState | None, SACState, Controller]):
@@ -102,7 +100,9 @@ class SAC(Stage[SACState | None, SACState, Controller]):
 
     def __init__(self, config: SACConfig, task: Task):
         self.agent, self.task, self.total = Agent(config, task), task, config.steps
-        self.vector_steps = max(config.eval_every // config.num_envs, 1)
+        self.vector_steps = chunk_length(
+            -(-config.steps // config.num_envs), max(config.eval_every // config.num_envs, 1)
+        )
 
     @classmethod
     def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
@@ -123,7 +123,7 @@ class SAC(Stage[SACState | None, SACState, Controller]):
     def done(self, state: SACState) -> int:
         return int(state.env_steps)
 
-    def advance(self, states: list[SACState]) -> list[tuple[SACState, dict[str, Any]]]:
+    def advance(self, states: list[SACState]) -> list[tuple[SACState, Row]]:
         # The last chunk is as long as what is left, in whole steps of all environments.
         left = -(-(self.total - self.done(states[0])) // self.agent.config.num_envs)
         steps = min(self.vector_steps, left)
@@ -131,16 +131,14 @@ class SAC(Stage[SACState | None, SACState, Controller]):
             return [algorithm.train_chunk(self.agent, states[0], steps)]
         return algorithm.train_chunks(self.agent, states, steps)
 
-    def judge(
-        self, state: SACState, metrics: dict[str, Any]
-    ) -> tuple[dict[str, Any], list[tuple[Controller, float]]]:
+    def judge(self, state: SACState, metrics: Row) -> tuple[Row, Candidates]:
         policy = algorithm.greedy_policy(self.agent, state)
         c = nominal(policy, self.task)
         score = float(self.task.score(c))
         row = {"updates": int(state.updates), "score": score, "uptime": c.uptime, **metrics}
         return row, [(policy, score)]
 
-    def note(self, row: dict[str, Any]) -> str:
+    def note(self, row: Row) -> str:
         return f"reward {float(row['reward']):.2f}  score {row['score']:.3f}"
 
     def watched(self, state: SACState) -> Any:
@@ -148,7 +146,3 @@ class SAC(Stage[SACState | None, SACState, Controller]):
 
     def rekey(self, state: SACState, number: int) -> SACState:
         return state.replace(key=jax.random.fold_in(state.key, number))
-
-    def outcome(self, state: SACState, best: Controller | None) -> Controller:
-        assert best is not None
-        return best

@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -15,9 +15,7 @@ from ..controllers.catalogue import find_controller
 from ..errors import JaxpendError
 from ..files import to_json, write_atomically
 from ..gradient import Gradient
-from ..runs.checkpoints import Checkpoints
 from ..runs.folder import RunFolder, refuse_foreign, refuse_no_group
-from ..runs.reader import read_run
 from ..runs.statistics import summary
 from ..sac.stage import SAC, Imitation
 from ..snes import SNES
@@ -95,21 +93,8 @@ def stages_of(
     return stages
 
 
-def open_runs(config: Run, command: str, about: Mapping[str, Any]) -> Iterator[RunFolder]:
-    """The run folders of all seeds. Before the first is made, none of them may be foreign."""
-    seeds = config.of_seeds()
-    if config.seeds > 1:
-        refuse_no_group(config.folder)
-    for one in seeds:
-        refuse_foreign(one.folder)
-    for one in seeds:
-        yield RunFolder(one.folder, one, command, about)
-
-
 def train(
-    config: Run,
-    command: str = "jaxpend.train.train",
-    kinds: Sequence[type[Stage]] = STAGES,
+    config: Run, command: str = "jaxpend.train.train", kinds: Sequence[type[Stage]] = STAGES
 ) -> dict[str, Any]:
     """The stages that the configuration has, in its run folder: begun, or taken up again.
 
@@ -131,20 +116,21 @@ def train(
     stages = stages_of(config, start, task, kinds)
     about = {"plant": dict(task.parameters), "stages": [s.about() for s in stages.values()]}
     vmap = config.vmap == "yes" or (config.vmap == "auto" and jax.default_backend() != "cpu")
+    seeds, runs, waiting = config.of_seeds(), [], []
+    if config.seeds > 1:
+        refuse_no_group(config.folder)
+    for one in seeds:  # before the first folder is made
+        refuse_foreign(one.folder)
     with contextlib.ExitStack() as opened:
-        runs = []
-        folders = open_runs(config, command, about)
-        for one, folder in zip(config.of_seeds(), folders, strict=True):
-            opened.enter_context(folder)
-            checkpoints = Checkpoints(folder.path / "checkpoints", one.checkpoint.keep)
-            runs.append(SeedRun(one, folder, checkpoints, Board("v2", task), start))
-        waiting = []
+        for one in seeds:
+            folder = opened.enter_context(RunFolder(one.folder, one, command, about))
+            runs.append(SeedRun(one, folder, Board("v2", task), start))
         for run in runs:
             if (result := run.folder.result) is None:
                 waiting.append(run)
-                continue
-            text = f"{run.folder.path} is finished: score {result['score']:.4f}"
-            console.print(text, soft_wrap=True)
+            else:
+                text = f"{run.folder.path} is finished: score {result['score']:.4f}"
+                console.print(text, soft_wrap=True)
         try:
             with deferred():
                 for group in [waiting] if vmap else [[run] for run in waiting]:
@@ -152,22 +138,19 @@ def train(
         except Stopped as stop:
             text = f"{stop}; everything is in {config.folder}; to go on: {command}"
             raise Stopped(stop.signum, text) from None
-    return results_of(config, runs)
-
-
-def results_of(config: Run, runs: Sequence[SeedRun]) -> dict[str, Any]:
-    """What ``train`` returns. Raises ``JaxpendError`` if a run has failed."""
-    failed = [f"seed {run.config.seed}: {run.failed}" for run in runs if run.failed]
-    done = [read_run(run.folder.path) for run in runs if not run.failed]
-    results = [record.result for record in done if record.result is not None]
+    failed = [run for run in runs if run.failed]
+    results = [result for run in runs if (result := run.folder.result) is not None]
     if config.seeds == 1 and results:
         return results[0]
-    group = summary(results, done[0].headings) if results else {}
+    said: dict[str, Any] = {}
     if results:
-        write_atomically(config.folder / "seeds.json", to_json(group, indent=2) + "\n")
+        headings = {"start": "start"} | {stage.name: stage.heading for stage in stages.values()}
+        said = summary(results, headings)
+        write_atomically(config.folder / "seeds.json", to_json(said, indent=2) + "\n")
     if failed:
-        raise JaxpendError(failed[0] if config.seeds > 1 else runs[0].failed)
-    return group
+        seed = f"seed {failed[0].config.seed}: " if config.seeds > 1 else ""
+        raise JaxpendError(seed + failed[0].failed)
+    return said
 
 
 def train_group(runs: Sequence[SeedRun], stages: Mapping[str, Stage]) -> None:
@@ -176,9 +159,8 @@ def train_group(runs: Sequence[SeedRun], stages: Mapping[str, Stage]) -> None:
         run.begin(stages)
     names = list(stages)
     for number, stage in enumerate(stages.values()):
-        there = [
-            r for r in runs if not r.failed and (not r.stage or names.index(r.stage) <= number)
-        ]
+        going = [run for run in runs if not run.failed]
+        there = [run for run in going if not run.stage or names.index(run.stage) <= number]
         if there:
             train_stage(stage, there)
     for run in runs:

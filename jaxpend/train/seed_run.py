@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import jax
@@ -15,7 +15,7 @@ from ..pytree import Pytree
 from ..runs.checkpoints import Checkpoints
 from ..runs.folder import RunFolder
 from ..score import official
-from ..stage import Stage
+from ..stage import Candidates, Stage
 from ..terminal import console
 
 __all__ = ["SeedRun", "all_finite"]
@@ -27,7 +27,6 @@ class SeedRun:
 
     config: Run
     folder: RunFolder
-    checkpoints: Checkpoints
     board: Board
     start: Controller | None = None  # what a user has it start from
     stage: str = ""  # name of the stage it is in
@@ -44,6 +43,10 @@ class SeedRun:
 
     # What of it goes into the JSON part of a checkpoint.
     PLAIN: ClassVar = ("stage", "best_score", "best_at", "rollbacks", "stage_began", "result")
+
+    def __post_init__(self) -> None:
+        keep = self.config.checkpoint.keep
+        self.checkpoints = Checkpoints(self.folder.path / "checkpoints", keep)
 
     def begin(self, stages: Mapping[str, Stage]) -> None:
         """Go on from the newest good checkpoint, or from the beginning if there is none."""
@@ -68,7 +71,7 @@ class SeedRun:
             setattr(self, name, about[name])
         stage = stages[self.stage]
         if self.best is not None:
-            self._save_best(stage)  # the file may be of a later time
+            self._save("best", stage, self.best, self.best_at)  # the file may be of a later time
         console.print(f"resuming {self.folder.path} {self.where(stage)}", soft_wrap=True)
 
     def where(self, stage: Stage) -> str:
@@ -104,41 +107,32 @@ class SeedRun:
             self.folder.log(stage.name, **row)
             self._keep_best(stage, candidates)
             if candidates:
-                self._save(f"{stage.name}_last.npz", candidates[0][0], stage, at)
+                self._save("last", stage, candidates[0][0], at)
             return row
         text = f"{stage.title} diverged at {at:,} {stage.unit}"
-        goes_on = self.config.on_divergence == "rollback"
-        goes_on &= self.rollbacks < self.config.max_rollbacks
-        if goes_on:
+        rollback = self.config.on_divergence == "rollback"
+        if rollback and self.rollbacks < self.config.max_rollbacks:
             self.rollbacks += 1
             self.state = stage.rekey(self.state, self.rollbacks)
             console.print(f"{text}; going on {self.where(stage)} with another key", soft_wrap=True)
         else:
             self.checkpoint()
-            self.failed = f"{text}; {self._advice(stage)}"
+            text += f"; the last good state, {self.where(stage)}, is in {self.checkpoints.folder}"
+            text += ", the best policy beside it; a new run with a lower learning rate may help"
+            text += "" if rollback else ", or to go on in this one with --on-divergence rollback"
+            self.failed = text
         self.folder.log(stage.name, **row, finite=0)  # not in the checkpoint, since it comes again
         return row
 
-    def _advice(self, stage: Stage) -> str:
-        text = f"the last good state, {self.where(stage)}, is in {self.checkpoints.folder}"
-        text += ", the best policy beside it; a new run with a lower learning rate may help"
-        if self.config.on_divergence == "stop":
-            text += ", or to go on in this one with --on-divergence rollback"
-        return text
-
-    def _keep_best(self, stage: Stage, candidates: Sequence[tuple[Controller, float]]) -> None:
+    def _keep_best(self, stage: Stage, candidates: Candidates) -> None:
         for policy, score in candidates:
             if score > self.best_score or (stage.ties and score == self.best_score):
                 self.best, self.best_score, self.best_at = policy, score, stage.done(self.state)
-                self._save_best(stage)
+                self._save("best", stage, policy, self.best_at)
 
-    def _save_best(self, stage: Stage) -> None:
-        assert self.best is not None
-        self._save(f"{stage.name}_best.npz", self.best, stage, self.best_at)
-
-    def _save(self, name: str, policy: Controller, stage: Stage, at: int) -> None:
+    def _save(self, kept: str, stage: Stage, policy: Controller, at: int) -> None:
         about = {"stage": stage.name, stage.column: at, "seed": self.config.seed}
-        self.folder.save(name, policy, **about)
+        self.folder.save(f"{stage.name}_{kept}.npz", policy, **about)
 
     def leave(self, stage: Stage) -> None:
         """The stage is done: its result, and what the next one starts from."""

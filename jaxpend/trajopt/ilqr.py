@@ -54,16 +54,6 @@ class Solution(Pytree):
     rejected: jax.Array  # () int, iterations since the last one that improved
 
 
-def _simulate(problem, params, z0, u):
-    """States (N + 1, n) of an input sequence, without feedback."""
-
-    def step(z, u):
-        following = problem.step(params, z, u)
-        return following, following
-
-    return jnp.concatenate([z0[None], jax.lax.scan(step, z0, u)[1]])
-
-
 def _totals(problem, params, z, u):
     features = jax.vmap(problem.features, in_axes=(None, 0, 0, 0))
     return jnp.sum(features(params, jnp.arange(u.shape[0]), z[:-1], u), axis=0)
@@ -98,7 +88,6 @@ def _derivatives(problem, params, z, u, second_order):
 
 def _backward(problem, params, z, u, limit, mu, second_order):
     """Feed-forward (N,) and gains (N, n) of the control-limited Riccati recursion, and validity."""
-    f_w, f_ww, l_w, l_ww = _derivatives(problem, params, z, u, second_order)
     n = z.shape[1]
 
     def step(carry, now):
@@ -123,12 +112,12 @@ def _backward(problem, params, z, u, limit, mu, second_order):
 
     final = partial(problem.final, params)
     start = (jax.grad(final)(z[-1]), jax.hessian(final)(z[-1]), jnp.array(True))
-    inputs = (f_w, f_ww, l_w, l_ww, u)
+    inputs = (*_derivatives(problem, params, z, u, second_order), u)
     (_, _, valid), (change, gain) = jax.lax.scan(step, start, inputs, reverse=True)
     return change, gain, valid
 
 
-def _forward(problem, params, z, u, change, gain, limit, step_size, z0=None):
+def _forward(problem, params, z, u, change, gain, limit, step_size, z0):
     """States and inputs under ``u + step_size * change + gain (z' - z)``, clipped to the box."""
 
     def step(z_new, now):
@@ -137,14 +126,18 @@ def _forward(problem, params, z, u, change, gain, limit, step_size, z0=None):
         following = problem.step(params, z_new, u_new)
         return following, (following, u_new)
 
-    z0 = z[0] if z0 is None else z0
     z_new, u_new = jax.lax.scan(step, z0, (z[:-1], u, change, gain))[1]
     return jnp.concatenate([z0[None], z_new]), u_new
 
 
 def initial(problem: Problem, params: Any, z0: jax.Array, u: jax.Array, mu=1.0) -> Solution:
     """The starting point of ``iterate``: the trajectory of inputs ``u`` (N,) from ``z0`` (n,)."""
-    z = _simulate(problem, params, z0, u)
+
+    def step(z, u):
+        following = problem.step(params, z, u)
+        return following, following
+
+    z = jnp.concatenate([z0[None], jax.lax.scan(step, z0, u)[1]])
     return _start(problem, params, z, u, jnp.zeros((*u.shape, *z0.shape), z.dtype), mu)
 
 
@@ -152,9 +145,8 @@ def warm_start(
     problem: Problem, params: Any, z0: jax.Array, plan: Solution, limit: jax.Array, mu=1.0
 ) -> Solution:
     """``initial`` from an earlier plan, followed from ``z0`` under its own feedback."""
-    zeros = jnp.zeros_like(plan.u)
-    old = (plan.z, plan.u, zeros, plan.gain)
-    z, u = _forward(problem, params, *old, limit, 0.0, z0=z0)
+    old = (plan.z, plan.u, jnp.zeros_like(plan.u), plan.gain)
+    z, u = _forward(problem, params, *old, limit, 0.0, z0)
     return _start(problem, params, z, u, plan.gain, mu)
 
 
@@ -181,21 +173,19 @@ def iterate(
     change, gain, valid = _backward(problem, params, now.z, now.u, limit, now.mu, second_order)
 
     def attempt(step_size):
-        z, u = _forward(problem, params, now.z, now.u, change, gain, limit, step_size)
+        z, u = _forward(problem, params, now.z, now.u, change, gain, limit, step_size, now.z[0])
         return z, u, _cost(problem, params, z, u)
 
     z, u, cost = jax.vmap(attempt)(jnp.array(step_sizes, now.z.dtype))
     best = jnp.argmin(cost)
     better = valid & (cost[best] < now.cost)
-    growth = jnp.where(
-        better, jnp.minimum(0.6, now.growth * 0.6), jnp.maximum(1.6, now.growth * 1.6)
-    )
-    keep = lambda new, old: jnp.where(better, new, old)  # noqa: E731
+    easier, harder = jnp.minimum(0.6, now.growth * 0.6), jnp.maximum(1.6, now.growth * 1.6)
+    growth = jnp.where(better, easier, harder)
     return Solution(
-        z=keep(z[best], now.z),
-        u=keep(u[best], now.u),
+        z=jnp.where(better, z[best], now.z),
+        u=jnp.where(better, u[best], now.u),
         gain=jnp.where(valid, gain, now.gain),
-        cost=keep(cost[best], now.cost),
+        cost=jnp.where(better, cost[best], now.cost),
         mu=jnp.clip(now.mu * growth, MU_MIN, MU_MAX),
         growth=growth,
         rejected=jnp.where(better, 0, now.rejected + 1),

@@ -1,6 +1,5 @@
 """An optimised swing-up to follow, and its file: plain arrays and a JSON header."""
 
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..arrays import read_arrays, write_arrays
-from ..designs import ROBOTS, active_joint
 from ..errors import JaxpendError, choose
 from ..pytree import Pytree, pytree, static
+from ..robots import ROBOTS, active_joint, shipped
 
 __all__ = ["Reference", "load_reference", "save_reference"]
 
@@ -36,14 +35,14 @@ class Reference(Pytree):
     @property
     def goal(self) -> jax.Array:
         """Upright, (4,), on the turn of theta1 and theta2 where the swing-up ends."""
-        turn = 2 * jnp.pi
-        upright = jnp.array([jnp.pi, 0.0], self.x.dtype)
+        turn, upright = 2 * jnp.pi, jnp.array([jnp.pi, 0.0], self.x.dtype)
         angles = upright + turn * jnp.round((self.x[-1, :2] - upright) / turn)
         return jnp.concatenate([angles, jnp.zeros(2, self.x.dtype)])
 
-    def index(self, t: jax.Array) -> jax.Array:
-        """Step that time ``t`` (s) falls on, not clipped to the horizon; int."""
-        return jnp.round(t / self.dt).astype(int)
+    def at(self, t: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The step nearest to time ``t`` (s), one of the N, and whether ``t`` is before the end."""
+        index = jnp.round(t / self.dt).astype(int)
+        return jnp.clip(index, 0, self.steps - 1), index < self.steps
 
     def both(self, torque: jax.Array) -> jax.Array:
         """A torque of the driven joint () as torques of both joints (2,)."""
@@ -52,21 +51,10 @@ class Reference(Pytree):
 
 def save_reference(path: str | Path, reference: Reference, provenance: dict[str, Any]) -> None:
     """Write a trajectory file (.npz without pickle), atomically: float32, the torques float64."""
-    header = {
-        "format": FORMAT,
-        "kind": "swing-up",
-        "robot": reference.robot,
-        "dt": reference.dt,
-        "provenance": provenance,
-    }
+    header = {"format": FORMAT, "kind": "swing-up", "robot": reference.robot, "dt": reference.dt}
+    header["provenance"] = provenance
     arrays = {"x": np.asarray(reference.x, "f4"), "gain": np.asarray(reference.gain, "f4")}
     write_arrays(path, header, arrays | {"u": np.asarray(reference.u, "f8")})
-
-
-def _locate(robot_or_path: str | Path) -> Path:
-    if str(robot_or_path) not in ROBOTS:
-        return Path(robot_or_path)
-    return Path(str(resources.files("jaxpend").joinpath(f"trajectories/{robot_or_path}.npz")))
 
 
 def load_reference(robot_or_path: str | Path, *, robot: str | None = None) -> Reference:
@@ -77,7 +65,7 @@ def load_reference(robot_or_path: str | Path, *, robot: str | None = None) -> Re
     Raises:
         JaxpendError: no such file, not a trajectory file, or one for the other robot.
     """
-    path = _locate(robot_or_path)
+    path = shipped(robot_or_path, "trajectories")
     header, arrays = read_arrays(path, "trajectory")
     if header.get("kind") != "swing-up" or header.get("format") != FORMAT:
         raise JaxpendError(f"{path} is not a swing-up trajectory of format {FORMAT}")

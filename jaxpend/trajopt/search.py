@@ -1,10 +1,10 @@
 """``jaxpend optimise``: the best swing-up of a robot, from many random starts.
 
 1. Coarse (100 Hz): random sinusoids of torque over several horizons, one vmapped iLQR each; the
-   final cost and the sharpness of the criteria grow from stage to stage. The horizon decides
-   when the swing-up arrives, which is what gradients change least.
+   final cost and the sharpness of the criteria grow from stage to stage. There are several
+   horizons, because the horizon decides when the swing-up arrives, and gradients hardly change it.
 2. The distinct optima are held upright by LQR for the rest of a common horizon and optimised
-   there, so that they may shift what they like, the arrival included.
+   there, so that the time of arrival may change too.
 3. Fine (500 Hz): the best few are refined on the official time grid, and the official score of
    a closed loop (TVLQR) picks the winner.
 """
@@ -38,40 +38,24 @@ LONG_STAGES = (
 )  # fmt: skip
 FINE_STAGES = ((10.0, 0.02, 0.02), (30.0, 0.01, 0.01), (30.0, 0.005, 0.01), (30.0, 0.003, 0.005))
 SHORT_ITERATIONS, LONG_ITERATIONS, FINE_ITERATIONS = 60, 100, 40
-# Two optima whose objectives differ by less than this are one.
+# Two optima whose objectives differ by less than this are counted as one.
 SAME = 1e-4
-
-
-def _parameters(task, goal, dt, weight, line_width, power_width):
-    """The problem's parameters; the final cost has the shape of the LQR's cost-to-go."""
-    top = lqr(task.plant, task.robot, dt=None)
-    final = (
-        jnp.zeros((5, 5)).at[:4, :4].set(top.cost_to_go / top.cost_to_go[0, 0]).at[4, 4].set(0.1)
-    )
-    return swingup.SwingUp(
-        task.plant, jnp.append(goal, 0.0), weight * final, line_width, power_width,
-        task=task, dt=dt,
-    )  # fmt: skip
 
 
 def _stages(task, dt, stages, iterations, goal, u, mu=1.0):
     """All stages in turn on a batch of starts: goal (B, 4), u (B, N)."""
-    base = _parameters(task, goal[0], dt, 1.0, 0.1, 0.1)
+    top = lqr(task.plant, task.robot, dt=None).cost_to_go  # the shape of the final cost
+    final = jnp.zeros((5, 5)).at[:4, :4].set(top / top[0, 0]).at[4, 4].set(0.1)
 
     @jax.jit
     @partial(jax.vmap, in_axes=(0, 0, None))
     def solve(goal, u, stage):
-        weight, line_width, power_width = stage
-        p = base.replace(
-            goal=jnp.append(goal, 0.0),
-            final_weight=weight * base.final_weight,
-            line_width=line_width,
-            power_width=power_width,
-        )
+        weight, line, power = stage
+        goal = jnp.append(goal, 0.0)
+        p = swingup.SwingUp(task.plant, goal, weight * final, line, power, task, dt)
         limit = p.plant.torque_limit[p.joint]
-        return ilqr.solve(
-            swingup.problem(), p, jnp.zeros(5), u, limit, iterations=iterations, mu=mu
-        )
+        start = (p, jnp.zeros(5), u, limit)
+        return ilqr.solve(swingup.problem(), *start, iterations=iterations, mu=mu)
 
     for stage in stages:
         solution = solve(goal, u, stage)
@@ -158,14 +142,14 @@ def _coarse(task, search: Search, say):
 
 
 def find(
-    task: Task, config: Search = Search(), *, say: Callable[[str], None] = lambda line: None
+    task: Task, config: Search = Search(), *, say: Callable[[str], Any] = lambda line: None
 ) -> list[tuple[Reference, dict[str, Any]]]:
     """The optimum trajectories found, best official score first: a list of (Reference, report).
 
     The torque limit is ``config.torque_limit``, not the task's. Needs ``jax.enable_x64``. Raises
     ``JaxpendError`` for a torque limit that is not positive, or if no start came to an optimum.
     """
-    judged_on = Board("found", task)
+    board = Board("found", task)
     task = dataclasses.replace(task, torque_limit=config.torque_limit)
     plant = task.plant
     goal, labels, coarse = _coarse(task, config, say)
@@ -173,7 +157,8 @@ def find(
     if not best.size:
         raise JaxpendError("no start came to an optimum; give more starts or torque")
     goal, coarse = goal[best], jax.tree.map(lambda v: v[best], coarse)
-    # The regularisation may have grown at an optimum; gains to follow it with are those without.
+    # The regularisation may have grown at an optimum; the gains for following it are computed
+    # without regularisation.
     coarse = _stages(task, COARSE_DT, LONG_STAGES[-1:], 1, goal, coarse.u, mu=0.01)
     say("refining: " + ", ".join(f"{1 - c:.4f}" for c in np.asarray(coarse.cost)))
     u = _refine(coarse, plant, round(COARSE_DT / task.dt), task)
@@ -182,7 +167,7 @@ def find(
     gain = lqr(plant, task.robot, dt=task.dt).gain[task.joint]
     hold = round(config.hold / task.dt)
     z, held = _hold(fine.z[:, -1], goal, gain, plant, task.dt, hold, task)
-    found: list[tuple[Reference, dict[str, Any]]] = []
+    found = []
     for i, label in enumerate(best):
         reference = Reference(
             x=jnp.concatenate([fine.z[i, :, :4], z[i, :, :4]]),
@@ -191,7 +176,7 @@ def find(
             robot=task.robot,
             dt=task.dt,
         )
-        measured = official(tvlqr(plant, reference), judged_on)
+        measured = official(tvlqr(plant, reference), board)
         horizon, hits = labels[label]
         turns = round(float(goal[i, 1]) / (2 * np.pi))
         report = {"score": measured["score"], "turns_of_theta2": turns, "first_horizon": horizon,

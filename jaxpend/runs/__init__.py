@@ -1,0 +1,1 @@
+"""Run folders: what training writes into them, and what reads them without jax."""
