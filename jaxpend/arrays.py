@@ -39,10 +39,10 @@ def read_arrays(path: Path, what: str) -> tuple[dict[str, Any], dict[str, np.nda
         with np.load(content, allow_pickle=False) as file:
             arrays = dict(file)
         header = json.loads(str(arrays.pop("header")))
+        if not isinstance(header, dict):
+            raise TypeError
     except FileNotFoundError:
         raise JaxpendError(f"there is no {what} file {path}") from None
     except Exception:  # numpy and zipfile raise a dozen kinds for bytes that are not theirs
         raise JaxpendError(f"{path} is not a {what} file, or it is empty or cut off") from None
-    if not isinstance(header, dict):
-        raise JaxpendError(f"{path} is not a {what} file, or it is empty or cut off")
     return header, arrays

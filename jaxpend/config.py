@@ -154,17 +154,14 @@ class SACConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.replay_capacity < self.num_envs:
-            raise JaxpendError(
-                f"replay_capacity is {self.replay_capacity}; it must hold at least one step of all "
-                f"{self.num_envs} environments"
-            )
+            text = f"it must hold at least one step of all {self.num_envs} environments"
+            raise JaxpendError(f"replay_capacity is {self.replay_capacity}; {text}")
         shown = self.demonstrations
         if shown.episodes and self.batch_size < 2:
             raise JaxpendError("batch_size is 1; it must be at least 2, half are demonstrations")
         if shown.episodes and shown.duration < self.env.dt:
-            raise JaxpendError(
-                f"demonstrations.duration is {shown.duration}; it must not be shorter than env.dt"
-            )
+            text = f"demonstrations.duration is {shown.duration}"
+            raise JaxpendError(f"{text}; it must not be shorter than env.dt")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -86,7 +86,7 @@ def test_yaml_file(tmp_path):
         (lambda: designs.from_dict({"m1": 1.0}), "lack m2, l1"),
         (lambda: designs.from_dict(OWN | {"mass": 1}), "plant parameter 'mass'"),
         (lambda: designs.from_dict(OWN | {"m1": "heavy"}), "m1 is 'heavy'; it must be a number"),
-        (lambda: designs.from_dict(OWN | {"m1": float("nan")}), "m1 is nan; it must be finite"),
+        (lambda: designs.from_dict(OWN | {"m1": float("nan")}), "m1 is nan; it must be positive"),
         (lambda: designs.from_dict(OWN | {"g": float("inf")}), "g is inf; it must be finite"),
         (lambda: designs.from_dict(OWN | {"I2": 0.0}), "I2 is 0.0; it must be positive"),
         (lambda: designs.from_dict(OWN | {"tl1": -1}), "tl1 is -1.0; it must not be negative"),

@@ -15,25 +15,7 @@ from ..fields import Count, Natural, Positive, Robot, Seed
 from .output import check_file, check_folder, emit, emit_json
 
 if TYPE_CHECKING:
-    import jax
-
     from ..boards import Board
-    from ..controller import Controller
-    from ..plant import Plant
-
-__all__ = [
-    "execute",
-    "gradient",
-    "leaderboard",
-    "optimise",
-    "report",
-    "robustness",
-    "runs",
-    "sac",
-    "score",
-    "snes",
-    "train",
-]
 
 
 def train(config: TrainRun, command: str) -> None:
@@ -154,8 +136,8 @@ def score(
     from .tables import score_table
 
     board, file = _board(robot, plant, design), policy or (None if controller else robot)
-    about = {"policy": file, "controller": controller, "plant": plant, "design": design}
-    about["header"] = read_header(file) if file else None
+    about: dict[str, Any] = {"policy": file, "controller": controller, "plant": plant}
+    about |= {"design": design, "header": read_header(file) if file else None}
     with jax.enable_x64(True):
         judged = find_controller(policy, controller, board.task)
     result = official(judged, board) | about
@@ -226,15 +208,7 @@ def robustness(
     emit_json(result, json)
 
 
-def _benchmarked(
-    judged: "Controller",
-    plant: "Plant",
-    key: "jax.Array",
-    keys: int,
-    map: tuple[str, str] | None,
-    worst: int,
-    options: dict[str, Any],
-) -> dict[str, Any]:
+def _benchmarked(judged, plant, key, keys, map, worst, options):
     """The report of the benchmark, and the map and the mildest failure that are asked for."""
     from ..robustness import benchmark, nominal_and_worst, success_map
     from ..sweep import mildest_failure

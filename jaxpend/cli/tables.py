@@ -21,14 +21,19 @@ SHORT_ROBUSTNESS = ("model", "vel.", "torque", "resp.", "delay", "pulses")
 COLOURS = {"finished": "green", "running": "cyan", "interrupted": "yellow", "broken": "red"}
 
 
+def _table(*headings: str, **look: Any) -> Table:
+    """A table with a column of text, then columns of numbers."""
+    table = Table(**look)
+    for number, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if number else "left")
+    return table
+
+
 def score_table(results: Mapping[str, Mapping], board: "Board") -> None:
     """Print results of ``score.official``, a column each, and the published scores."""
     from ..boards import HEADINGS  # loads jax
 
-    table = Table(title=f"{board.robot}, {board.name}: score (float64)")
-    table.add_column("")
-    for name in results:
-        table.add_column(name, justify="right")
+    table = _table("", *results, title=f"{board.robot}, {board.name}: score (float64)")
     table.add_row("score", *(Text(f"{r['score']:.4f}", "bold") for r in results.values()))
     table.add_row("success", *("yes" if r.get("success") else "no" for r in results.values()))
     for key, (heading, unit, form) in HEADINGS.items():
@@ -45,9 +50,8 @@ def robustness_table(result: Mapping[str, Any], board: "Board") -> None:
     from ..boards import CRITERIA  # loads jax
 
     title = f"{board.robot}, {board.name}: robustness, {result['simulations']} runs"
-    table = Table(title=f"{title} of {board.task.duration:g} s")
-    for heading in ("", "score [%]", "over keys [%]", "diverged"):
-        table.add_column(heading, justify="right" if heading else "left")
+    title += f" of {board.task.duration:g} s"
+    table = _table("", "score [%]", "over keys [%]", "diverged", title=title)
     over = result["over_keys"]
     several = len(over["overall"]) > 1
     for name, found in result["criteria"].items():
@@ -80,10 +84,10 @@ def leaderboard_table(result: Mapping[str, Any], board: "Board") -> None:
     columns = ["score", *SHORT, *SHORT_ROBUSTNESS, "robust"]
     for title, headings in parts.items():
         caption = "* published" if board.published else None
-        table = Table(title=f"{board.robot}, {board.name}: {title}", caption=caption)
-        for heading in ("controller", *headings):
-            right = heading != "controller"
-            table.add_column(heading, justify="right" if right else "left", no_wrap=True)
+        title = f"{board.robot}, {board.name}: {title}"
+        table = _table("controller", *headings, title=title, caption=caption)
+        for column in table.columns:
+            column.no_wrap = True
         for row in result["rows"]:
             shown = dict(zip(columns, cells(row)[1:], strict=True))
             style = "dim" if row["source"] == "published" else None
@@ -118,10 +122,9 @@ def runs_table(entries: Sequence[Mapping[str, Any]]) -> None:
 
 def seeds_table(group: Mapping[str, Any]) -> None:
     """Print a ``runs.statistics.summary``."""
-    table = Table(title=f"{group['robot']}: official v2 score of {len(group['seeds'])} seeds")
+    title = f"{group['robot']}: official v2 score of {len(group['seeds'])} seeds"
     headings = ("", "median", "interquartile mean", "95 %", "lowest to highest")
-    for heading in headings:
-        table.add_column(heading, justify="right" if heading else "left")
+    table = _table(*headings, title=title)
     for found in group["stages"].values():
         ends = (found["interval"], (found["lowest"], found["highest"]))
         points = (f"{found[key]:.4f}" for key in ("median", "interquartile_mean"))
