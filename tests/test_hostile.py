@@ -79,7 +79,8 @@ def template(tmp_path_factory):
         arrays = dict(file)
     header = json.loads(str(arrays["header"])) | {"provenance": [1]}
     np.savez(folder / "provenance.npz", **arrays | {"header": np.array(json.dumps(header))})
-    for name, content in (("junk", "{"), ("none", "[]"), ("old", '{"robot": "acrobot"}')):
+    old = '{"robot": "acrobot"}'
+    for name, content in (("junk", "{"), ("none", "[]"), ("old", old), ("group/seed1", old)):
         (folder / "runs" / name).mkdir(parents=True)
         (folder / "runs" / name / "config.json").write_text(content)
     return folder
@@ -200,6 +201,7 @@ CASES = [
     ("sac --runs own.py", "cannot use own.py/pendubot-sac-seed0: Not a directory"),
     ("sac --runs runs --run old", "runs/old holds a run of jaxpend (unknown version), this is "),
     ("sac --runs . --run runs --seeds 2", "runs is not empty and holds no runs of several seeds"),
+    ("sac --runs runs --run group --seeds 2", "runs/group/seed1 holds a run of jaxpend (unknown"),
     ("sac --runs . --run .", ". is not empty and holds no run; choose another name"),
 ]  # fmt: skip
 

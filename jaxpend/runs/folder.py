@@ -20,7 +20,7 @@ from ..files import TEMPORARY, remove_temporary, to_json, write_atomically
 from . import tensorboard
 from .reader import Unreadable, read_json, read_result, seed_folders
 
-__all__ = ["RunFolder", "refuse_foreign", "refuse_no_group"]
+__all__ = ["RunFolder", "refuse_no_group", "refuse_other"]
 
 # Where a run is, and how it is kept, may change when it goes on; what it computes must not.
 MAY_DIFFER = (
@@ -67,6 +67,30 @@ def _object(path: Path) -> dict[str, Any]:
     return value
 
 
+def refuse_other(path: Path, config: Any, about: Mapping[str, Any]) -> None:
+    """Raise ``JaxpendError`` for a folder that is no run's, or another run's: see ``RunFolder``."""
+    refuse_foreign(path)
+    if not (path / "config.json").exists():
+        return
+    try:
+        made_by, written = _object(path / "run.json"), _object(path / "config.json")
+        read_result(path / "result.json")
+    except Unreadable as error:
+        raise JaxpendError(f"{error.path} is damaged; {INSTEAD}") from None
+    there = made_by.get("version", "(unknown version)")
+    if there != __version__:
+        text = f"{path} holds a run of jaxpend {there}, this is {__version__}; {INSTEAD}"
+        raise JaxpendError(text)
+    # A plant is compared by its parameters, not by the name of its file.
+    stored = flat(written | {"plant": made_by.get("plant")})
+    given = flat(to_mapping(config) | {"plant": about.get("plant")})
+    for field in given | stored:
+        there, here = stored.get(field), given.get(field)
+        if there != here and field.partition(".")[0] not in MAY_DIFFER:
+            text = f"{path} holds a run with {field} {to_json(there)}, not {to_json(here)}"
+            raise JaxpendError(f"{text}; {INSTEAD}")
+
+
 class RunFolder(contextlib.AbstractContextManager):
     """Where a run leaves its configuration, metrics, policies and result.
 
@@ -93,40 +117,17 @@ class RunFolder(contextlib.AbstractContextManager):
             tensorboard.require()
         self.config, self.started = to_mapping(config), time.perf_counter()
         self._close = lambda: None
-        self._check()
+        refuse_other(self.path, config, self.about)
         if self.result is None:
             self.path.mkdir(parents=True, exist_ok=True)
             self._lock()
-            self._check()  # again: another process may have made it meanwhile
+            refuse_other(self.path, config, self.about)  # it may have been made meanwhile
             remove_temporary(self.path)
         if not (self.path / "config.json").exists():
             made_by = {"version": __version__, "jax": version("jax"), "command": command}
             about = {"stages": [], "changed": changed(config), **self.about}
             self.write_json("run.json", {**made_by, **about})
             self.write_json("config.json", self.config)  # last: it says that a run is here
-
-    def _check(self) -> None:
-        """Refuse a folder that is no run's, or that of another run."""
-        refuse_foreign(self.path)
-        if not (self.path / "config.json").exists():
-            return
-        try:
-            made_by, config = _object(self.path / "run.json"), _object(self.path / "config.json")
-            read_result(self.path / "result.json")
-        except Unreadable as error:
-            raise JaxpendError(f"{error.path} is damaged; {INSTEAD}") from None
-        there = made_by.get("version", "(unknown version)")
-        if there != __version__:
-            text = f"{self.path} holds a run of jaxpend {there}, this is {__version__}; {INSTEAD}"
-            raise JaxpendError(text)
-        # A plant is compared by its parameters, not by the name of its file.
-        stored = flat(config | {"plant": made_by.get("plant")})
-        given = flat(self.config | {"plant": self.about.get("plant")})
-        for field in given | stored:
-            there, here = stored.get(field), given.get(field)
-            if there != here and field.partition(".")[0] not in MAY_DIFFER:
-                text = f"{self.path} holds a run with {field} {to_json(there)}, not {to_json(here)}"
-                raise JaxpendError(f"{text}; {INSTEAD}")
 
     def _lock(self) -> None:
         # The system releases it when the process ends, however it ends.

@@ -15,7 +15,7 @@ from ..controllers.catalogue import find_controller
 from ..errors import JaxpendError
 from ..files import to_json, write_atomically
 from ..gradient import Gradient
-from ..runs.folder import RunFolder, refuse_foreign, refuse_no_group
+from ..runs.folder import RunFolder, refuse_no_group, refuse_other
 from ..runs.statistics import summary
 from ..sac.stage import SAC, Imitation
 from ..snes import SNES
@@ -120,7 +120,7 @@ def train(
     if config.seeds > 1:
         refuse_no_group(config.folder)
     for one in seeds:  # before the first folder is made
-        refuse_foreign(one.folder)
+        refuse_other(one.folder, one, about)
     with contextlib.ExitStack() as opened:
         for one in seeds:
             folder = opened.enter_context(RunFolder(one.folder, one, command, about))
