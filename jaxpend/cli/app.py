@@ -23,23 +23,17 @@ __all__ = ["COMMANDS", "Command", "main", "one_sentence", "run"]
 class Command:
     """A subcommand; its function is that of its name in ``commands``."""
 
-    group: str
-    summary: str
-    example: str  # its arguments
+    group: str = ""
+    summary: str = ""
+    example: str = ""  # its arguments, for the help
     computes: bool = True  # with jax
 
 
 COMMANDS = {
     "train": Command(
-        "train a policy",
-        "SAC, then SNES, then the official score",
-        "--config pendubot --seed 1",
+        "train a policy", "SAC, then SNES, then the official score", "--config pendubot --seed 1"
     ),
-    "sac": Command(
-        "train a policy",
-        "SAC on the surrogate reward",
-        "--config pendubot --seed 1",
-    ),
+    "sac": Command("train a policy", "SAC on the surrogate reward", "--config pendubot --seed 1"),
     "gradient": Command(
         "train a policy",
         "the gradient of the smooth score, from a policy or any other controller",
@@ -66,20 +60,11 @@ COMMANDS = {
         "--robot acrobot --no-robustness",
     ),
     "runs": Command(
-        "look at runs",
-        "list runs with their state and scores",
-        "runs --json -",
-        computes=False,
+        "look at runs", "list runs with their state and scores", "runs --json -", computes=False
     ),
-    "report": Command(
-        "look at runs",
-        "one page about a run, with pictures",
-        "runs/mine",
-    ),
+    "report": Command("look at runs", "one page about a run, with pictures", "runs/mine"),
     "optimise": Command(
-        "optimise a trajectory",
-        "find the best swing-up",
-        "--robot acrobot --out swingup.npz",
+        "optimise a trajectory", "find the best swing-up", "--robot acrobot --out swingup.npz"
     ),
 }
 
@@ -143,28 +128,19 @@ def main(*prefix: str) -> NoReturn:
             raise JaxpendError(f"unknown {what} {name!r}; {hint}")
         else:
             found = getattr(importlib.import_module(".commands", __package__), name)
-            example, computes = COMMANDS[name].example, COMMANDS[name].computes
-            run(found, f"jaxpend {name}", rest, example=example, computes=computes)
+            run(found, f"jaxpend {name}", rest, COMMANDS[name])
     sys.exit(0)
 
 
-def run(
-    function: Callable[..., None],
-    prog: str,
-    args: Sequence[str] | None = None,
-    *,
-    example: str = "",
-    computes: bool = True,
-) -> NoReturn:
-    """Call a function with the parameters that the command line gives; exit.
-
-    ``example`` is for the help; ``computes`` says that the function uses jax.
-    """
+def run(function: Callable[..., None], prog: str, args: Sequence[str] | None = None,
+        about: Command = Command()) -> NoReturn:  # fmt: skip
+    """Call a function with the parameters that the command line gives; exit."""
     with one_sentence(prog):
-        call = parse(function, prog, sys.argv[1:] if args is None else args, example=example)
+        args = sys.argv[1:] if args is None else args
+        call = parse(function, prog, args, example=about.example)
         if call.func is not print:  # which prints the help
             compile_cache()
-            if computes:
+            if about.computes:
                 check_platform()
                 # It prints the traceback of a user's function, which becomes a sentence here.
                 logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)
@@ -174,8 +150,8 @@ def run(
 
 def overview() -> str:
     """The help of ``jaxpend`` itself."""
-    lines = ["usage: jaxpend COMMAND [OPTIONS]", "", "Train and judge controllers for the acrobot"]
-    lines[-1] += " and the pendubot, end to end in JAX."
+    lines = ["usage: jaxpend COMMAND [OPTIONS]", ""]
+    lines += ["Train and judge controllers for the acrobot and the pendubot, end to end in JAX."]
     for group in dict.fromkeys(command.group for command in COMMANDS.values()):
         lines += ["", f"{group}:"]
         lines += [f"  {n:<12} {c.summary}" for n, c in COMMANDS.items() if c.group == group]
@@ -188,13 +164,8 @@ def overview() -> str:
 
 def versions() -> str:
     """Versions of what decides about results; loads no backend."""
-    from importlib.metadata import PackageNotFoundError, version
+    from importlib.metadata import version
 
-    found = {"jaxpend": __version__}
-    for name in ("jax", "jaxlib"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "missing"
+    found = {"jaxpend": __version__, "jax": version("jax"), "jaxlib": version("jaxlib")}
     found["python"] = ".".join(map(str, sys.version_info[:3]))
     return "\n".join(f"{name} {number}" for name, number in found.items())
