@@ -57,9 +57,8 @@ def parse(
                 raise JaxpendError(f"--config needs a YAML file, or a recipe: {known}")
             for file in files:
                 # One file serves several commands: what only others have is passed over.
-                others = {
-                    name for kind in (GradientRun, SNESRun, TrainRun) for name in hints_of(kind)
-                }
+                kinds = (GradientRun, SNESRun, TrainRun)
+                others = [name for kind in kinds for name in hints_of(kind)]
                 config = load_config(config, file, also=others)
             positional.append(from_mapping(config, values, "", "--"))
         elif dataclasses.is_dataclass(hints[name]):
