@@ -16,6 +16,7 @@ import typing
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NoReturn
 
+from ..config import GradientRun, SNESRun, TrainRun
 from ..config_files import from_mapping, load_config, recipes
 from ..errors import JaxpendError
 from ..fields import OFF, ON, checked, described, hints_of, split
@@ -23,8 +24,6 @@ from ..fields import OFF, ON, checked, described, hints_of, split
 __all__ = ["parse", "similar"]
 
 HELP, FULL_HELP = {"-h", "--help"}, {"-H", "--help-verbose"}
-# One file serves several commands: sections that a command has no field for are passed over.
-SECTIONS = ("policy", "sac", "gradient", "guard", "snes")
 REQUIRED = inspect.Parameter.empty
 # Before a word: it is a value, whatever it looks like. A shell cannot pass this character.
 VALUE = "\0"
@@ -57,7 +56,10 @@ def parse(
                 known = ", ".join(recipes())
                 raise JaxpendError(f"--config needs a YAML file, or a recipe: {known}")
             for file in files:
-                config = load_config(config, file, also=SECTIONS)
+                # One file serves several commands: what only others have is passed over.
+                kinds = (GradientRun, SNESRun, TrainRun)
+                others = [name for kind in kinds for name in hints_of(kind)]
+                config = load_config(config, file, also=others)
             positional.append(from_mapping(config, values, "", "--"))
         elif dataclasses.is_dataclass(hints[name]):
             named[name] = from_mapping(parameter.default, values.get(name, {}), "", f"--{name}.")

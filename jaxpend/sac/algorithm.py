@@ -18,7 +18,7 @@ from ..controllers.policy import Policy
 from ..env import Env, EnvState
 from ..pytree import Pytree, pytree
 from . import losses, replay
-from .critics import TwinCritic
+from .critics import Critic, TwinCritic
 from .demonstrations import Imitation, imitate, imitation, swingups
 from .networks import Actor, Params, act, constant_log_std, to_policy
 from .replay import Replay, Transition
@@ -59,7 +59,7 @@ class Agent:
         return Actor(self.config.actor_hidden, self.config.activation)
 
     @cached_property
-    def critic(self) -> TwinCritic:
+    def critic(self) -> Critic:
         """What judges actions."""
         config = self.config
         return TwinCritic(config.critic_hidden, config.activation, config.critic_layer_norm)
