@@ -91,14 +91,14 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     def shown(value: float | None, form: str) -> str:
         return "" if value is None else format(value, form)
 
-    criteria = (row.get("success") and row.get("criteria")) or dict.fromkeys(HEADINGS)
-    six = row.get("robustness_criteria") or dict.fromkeys(CRITERIA)
+    criteria = (row.get("success") and row.get("criteria")) or {}
+    six = row.get("robustness_criteria") or {}
     title = row["title"] + (" (published)" if row["source"] == "published" else "")
     return [
         title,
         shown(row["score"], ".3f"),
-        *(shown(criteria[name], form) for name, (_, _, form) in HEADINGS.items()),
-        *(shown(six[name], ".2f") for name in CRITERIA),
+        *(shown(criteria.get(name), form) for name, (_, _, form, _) in HEADINGS.items()),
+        *(shown(six.get(name), ".2f") for name in CRITERIA),
         shown(row["robustness"], ".3f"),
     ]
 
@@ -111,7 +111,7 @@ def _range(row: Mapping[str, Any]) -> str:
 
 def markdown(board: Mapping[str, Any]) -> str:
     """The board as a Markdown table; of several keys, median and range of the robustness."""
-    criteria = [f"{heading} [{unit}]" for heading, unit, _ in HEADINGS.values()]
+    criteria = [f"{heading} [{unit}]" for heading, unit, *_ in HEADINGS.values()]
     headings = ["controller", "score", *criteria, *CRITERIA.values(), "robustness"]
     lines = [headings, ["---"] + ["---:"] * (len(headings) - 1)]
     for row in board["rows"]:

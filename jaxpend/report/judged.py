@@ -96,7 +96,7 @@ def criteria_costs(judged: Judged, board: Board) -> list[dict[str, Any]]:
     norms = dict(getattr(board.task.scoring, "norms", ()))
     rows = []
     for name, norm in norms.items():
-        title, unit, form = HEADINGS[name]
+        title, unit, form, _ = HEADINGS[name]
         value = judged.criteria[name]
         share = math.tanh(math.pi * value / norm)
         share = share if math.isfinite(share) else 1.0
