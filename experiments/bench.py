@@ -24,7 +24,7 @@ from jaxpend.controllers import Policy
 from jaxpend.controllers.catalogue import build
 from jaxpend.observation import Observation
 from jaxpend.sac.stage import SAC
-from jaxpend.score import performance, score_v2
+from jaxpend.score import performance
 from jaxpend.snes import SNES
 
 
@@ -71,25 +71,28 @@ def bench_seeds(count: int = 4) -> None:
         "SAC": (training, [sac.init(agent, key) for key in keys]),
         "SNES": (search, [search.start(seed, random_policy(64)) for seed in range(count)]),
     }
+
+    def one_after_another(stage, states):
+        return [stage.advance([state]) for state in states]
+
     for name, (stage, states) in parts.items():
-        loop = lambda stage=stage, states=states: [stage.advance([s]) for s in states]  # noqa: E731
-        vmap = lambda stage=stage, states=states: stage.advance(states)  # noqa: E731
-        times = []
-        for how, f in (("one after another", loop), ("vmap", vmap)):
-            times.append(timed(f))
-            speed = f"({times[0][1] / times[-1][1]:.2f} x as fast)"
-            show(f"{name}: a chunk of {count} seeds, {how}", times[-1], speed)
+        alone = timed(one_after_another, stage, states)
+        together = timed(stage.advance, states)
+        show(f"{name}: a chunk of {count} seeds, one after another", alone)
+        speed = f"({alone[1] / together[1]:.2f} x as fast)"
+        show(f"{name}: a chunk of {count} seeds, vmap", together, speed)
 
 
 def rollouts(controller, robot: str, name: str, batches, runs: int = 5) -> None:
     """Scored rollouts of 10 s in batches."""
-    plant = designs.competition(robot)
+    task = v2(robot).task
     for batch in batches:
         # Different starts: rollouts that are all the same would be computed once.
         starts = 0.01 * jax.random.normal(jax.random.key(1), (batch, 4))
 
         def scored(x0):
-            return score_v2(performance(controller, Scenario(plant, x0=x0), jax.random.key(0)))
+            scenario = Scenario(task.plant, x0=x0)
+            return task.score(performance(controller, scenario, jax.random.key(0), task))
 
         times = timed(jax.jit(jax.vmap(scored)), starts, runs=runs)
         speed = f"({batch * 10 / times[1]:,.1f} x real time)"
@@ -135,9 +138,8 @@ def bench_snes() -> None:
         config = snes.SNESConfig(action_noise=0.0, scenarios=scenarios)
         policy = random_policy(64)
         start = snes.init(config, policy, jax.random.key(0))
-        evolve = lambda s, c=config, p=policy: snes.evolve(c, p, s, 2)[1]  # noqa: E731
-        compile_time, *rest = timed(evolve, start)
-        times = (compile_time, *(seconds / 2 for seconds in rest))
+        compile_time, run, processor = timed(snes.evolve, config, policy, start, 2)
+        times = compile_time, run / 2, processor / 2
         show(f"SNES: a generation of 40, {scenarios} scenarios, 2x64", times)
 
 

@@ -11,6 +11,7 @@ import json
 from pathlib import Path
 
 from jaxpend import designs, leaderboard
+from jaxpend.boards import v2
 from jaxpend.config import SNESConfig, SNESRun
 from jaxpend.controllers import load_controller
 from jaxpend.controllers.catalogue import CATALOGUE, build
@@ -38,7 +39,7 @@ CASES = {
 
 def judged(make, robot: str, keys: int) -> dict:
     """Official score, and robustness over benchmark keys."""
-    found = leaderboard.judge(make, robot, keys=keys)
+    found = leaderboard.judge(make, v2(robot), keys=keys)
     return {name: found[name] for name in ("score", "robustness", "robustness_by_key", "criteria")}
 
 

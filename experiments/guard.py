@@ -69,14 +69,11 @@ def build(main, robot: str, changes: dict):
 
 def draw(plant, robot: str, runs: int, seed: int):
     """``runs`` scenarios of the three kinds, and which kind each is (index in ``KINDS``)."""
-    many = jax.jit(jax.vmap(lambda k: sample(plant, k)))(
-        jax.random.split(jax.random.key(seed), 3 * runs)
-    )
-    quiet = (np.asarray(many.measurement_noise) == 0).all(1) & (
-        np.asarray(many.torque_noise) == 0
-    ).all(1)
-    chosen = np.flatnonzero(quiet & (np.asarray(many.responsiveness) == 1))[:runs]
-    some = jax.tree.map(lambda a: np.asarray(a)[chosen], many)
+    keys = jax.random.split(jax.random.key(seed), 3 * runs)
+    many = jax.tree.map(np.asarray, jax.jit(jax.vmap(lambda k: sample(plant, k)))(keys))
+    quiet = (many.measurement_noise == 0).all(1) & (many.torque_noise == 0).all(1)
+    chosen = np.flatnonzero(quiet & (many.responsiveness == 1))[:runs]
+    some = jax.tree.map(lambda leaf: leaf[chosen], many)
     pulses = np.abs(some.pulses.amplitude).sum((1, 2)) > 0
     return some, np.where(some.delay[:, 0] > 0, 1, np.where(pulses, 2, 0))
 
@@ -84,7 +81,10 @@ def draw(plant, robot: str, runs: int, seed: int):
 @jax.jit
 def survives(controller, scenarios, keys):
     """Whether each run ends upright."""
-    end = lambda s, k: final_state(s, controller, k, delay_slots=LONGEST_DELAY + 1)  # noqa: E731
+
+    def end(scenario, key):
+        return final_state(scenario, controller, key, delay_slots=LONGEST_DELAY + 1)
+
     return upright(jax.vmap(end)(scenarios, keys))
 
 
@@ -92,8 +92,8 @@ def main(runs: int = 1024, seed: int = 0, out: Path = Path(__file__).parent / "g
     """Judge every variant around TVLQR on the shipped swing-up, as it is demonstrated."""
     lines = [
         f"Fraction of {runs} random scenarios that end upright (seed {seed}), the main controller",
-        "being TVLQR. Standard error about 0.01 (all), 0.02 (a kind); the same scenarios in every",
-        "row.",
+        "being TVLQR as it is demonstrated (r=10, delay 0.044 s; the leaderboard has the plain",
+        "one). Standard error about 0.01 (all), 0.02 (a kind); the same scenarios in every row.",
     ]
     for robot in designs.ROBOTS:
         plant = designs.competition(robot)

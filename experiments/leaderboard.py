@@ -52,13 +52,9 @@ def main(
             title = CATALOGUE[name].title
             console.print(f"judging {title} of the {robot} ...")
             row = {"name": name, "title": title, "source": "measured"}
-            row |= leaderboard.judge(
-                partial(build, name, robot=robot),
-                v2(robot),
-                keys=keys,
-                seed=seed,
-                robustness=robustness,
-            )
+            make = partial(build, name, robot=robot)
+            options = {"keys": keys, "seed": seed, "robustness": robustness}
+            row |= leaderboard.judge(make, v2(robot), **options)
             boards = merged(path, robot, row)
             cli.emit_json(boards, path)
             tables = [(r, leaderboard.markdown(boards[r])) for r in designs.ROBOTS if r in boards]

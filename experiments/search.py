@@ -193,7 +193,7 @@ def measure(name: tuple, about: tuple | None, runs: Path) -> dict:
         stage = stage_of(method, size, share, robot, start, **options)
         best, effort = climb(stage, start, seed, seconds)
         row |= effort
-    judge = partial(leaderboard.judge, robot=robot, robustness=benchmarked, keys=3)
+    judge = partial(leaderboard.judge, board=v2(robot), robustness=benchmarked, keys=3)
     found = judge(lambda plant: best)
     row["score"] = found["score"]
     if not benchmarked:

@@ -23,6 +23,7 @@ import numpy as np
 from seeds import ROBOTS, folder_of, train
 
 from jaxpend import designs
+from jaxpend.boards import v2
 from jaxpend.controllers import load_reference, tvlqr
 from jaxpend.report.charts import draw_curves
 from jaxpend.report.figures import PALETTE, save, stack
@@ -46,8 +47,12 @@ def ceiling(robot: str, limit: float, runs: Path, starts: int) -> dict:
             found = "shipped"
             measured = official(tvlqr(designs.competition(robot, limit), reference), robot)
         else:
-            say = lambda line: print(f"{robot}, {limit:g} N m: {line}", file=sys.stderr)  # noqa: E731
-            measured = find(robot, Search(torque_limit=limit, starts=starts), say=say)[0][1]
+
+            def say(line):
+                print(f"{robot}, {limit:g} N m: {line}", file=sys.stderr)
+
+            config = Search(torque_limit=limit, starts=starts)
+            measured = find(v2(robot).task, config, say=say)[0][1]
     result = {"score": measured["score"], "peak": measured["criteria"]["max_tau"], "found": found}
     path.write_text(json.dumps(result))
     return result

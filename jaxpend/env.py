@@ -153,16 +153,14 @@ class Env:
         key, key_noise = jax.random.split(world.key)
 
         def step(carry, z):
-            x, applied, states, k, _ = carry
-            applied = actuate(scenario, torque, applied, k * dt, z)
+            x, now = carry
+            applied, k = actuate(scenario, torque, now.applied, now.k * dt, z), now.k + 1
             x = rk4_step(scenario.plant, x, applied, dt)
-            states, measured = measure(scenario, states, k + 1, x, z)
-            return (x, applied, states, k + 1, measured), None
+            states, measured = measure(scenario, now.states, k, x, z)
+            return (x, World(scenario, states, measured, applied, k, key)), None
 
-        start = (x, world.applied, world.states, world.k, world.measured)
         noise = draws(scenario, key_noise, None, steps, x.dtype)
-        (x, applied, states, k, measured), _ = jax.lax.scan(step, start, noise)
-        return x, World(scenario, states, measured, applied, k, key)
+        return jax.lax.scan(step, (x, world.replace(key=key)), noise)[0]
 
     @property
     def mirrored(self) -> tuple[tuple[int, ...], tuple[int, ...]]:

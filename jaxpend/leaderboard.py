@@ -1,4 +1,4 @@
-"""``jaxpend leaderboard``: every controller on both v2 boards, next to published rows.
+"""``jaxpend leaderboard``: every controller on the v2 board of a robot, next to the published rows.
 
 Performance is the official score and its criteria in float64; robustness is the six-criterion
 benchmark in float32, as ``jaxpend robustness`` runs it.
@@ -46,17 +46,17 @@ def judge(
         keys, seed: of ``robustness.benchmark``.
     """
     with jax.enable_x64(True):
-        result = official(make(board.task.plant), board)
-    result = {name: result[name] for name in ("score", "success", "criteria")}
+        found = official(make(board.task.plant), board)
+    result = {name: found[name] for name in ("score", "success", "criteria")}
     if not robustness:
         return result | {"robustness": None}
     start = time.perf_counter()
     with jax.enable_x64(False):
-        found = benchmark(make(board.task.plant), board, jax.random.key(seed), keys=keys)
+        report = benchmark(make(board.task.plant), board, jax.random.key(seed), keys=keys)
     return result | {
-        "robustness": found.overall,
-        "robustness_by_key": found.overall_by_key,
-        "robustness_criteria": found.scores,
+        "robustness": report.overall,
+        "robustness_by_key": report.overall_by_key,
+        "robustness_criteria": report.scores,
         "robustness_seconds": time.perf_counter() - start,
     }
 
@@ -81,8 +81,8 @@ def leaderboard(
         say(f"judging {title} ...")
         row = {"name": name, "title": title, "source": "measured"}
         rows.append(row | judge(make, board, **options))
-    ranked = sorted([*rows, *published(board)], key=lambda row: -row["score"])
-    return {"robot": board.robot, "rows": ranked}
+    rows += published(board)
+    return {"robot": board.robot, "rows": sorted(rows, key=lambda row: -row["score"])}
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:
@@ -91,22 +91,15 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     def shown(value: float | None, form: str) -> str:
         return "" if value is None else format(value, form)
 
-    criteria = (row.get("success") and row.get("criteria")) or {}
+    criteria = row["criteria"] if row.get("success") else {}
     six = row.get("robustness_criteria") or {}
-    title = row["title"] + (" (published)" if row["source"] == "published" else "")
     return [
-        title,
+        row["title"] + (" (published)" if row["source"] == "published" else ""),
         shown(row["score"], ".3f"),
         *(shown(criteria.get(name), form) for name, (_, _, form, _) in HEADINGS.items()),
         *(shown(six.get(name), ".2f") for name in CRITERIA),
         shown(row["robustness"], ".3f"),
     ]
-
-
-def _range(row: Mapping[str, Any]) -> str:
-    """Lowest and highest robustness of several keys."""
-    by_key = row.get("robustness_by_key") or ()
-    return f" ({min(by_key):.3f} to {max(by_key):.3f})" if len(by_key) > 1 else ""
 
 
 def markdown(board: Mapping[str, Any]) -> str:
@@ -115,26 +108,27 @@ def markdown(board: Mapping[str, Any]) -> str:
     headings = ["controller", "score", *criteria, *CRITERIA.values(), "robustness"]
     lines = [headings, ["---"] + ["---:"] * (len(headings) - 1)]
     for row in board["rows"]:
-        *others, robustness = cells(row)
-        lines.append([*others, robustness + _range(row)])
+        line, by_key = cells(row), row.get("robustness_by_key", ())
+        if len(by_key) > 1:
+            line[-1] += f" ({min(by_key):.3f} to {max(by_key):.3f})"
+        lines.append(line)
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
 def chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[str, tuple[str, Make]]:
-    """Name -> (title, make) of what the command line asks for."""
-    if controllers is None:
-        names = list(CATALOGUE)
-    else:
+    """Name -> (title, make) of what the command line asks for; without names, of all."""
+    names = list(CATALOGUE)
+    if controllers is not None:
         names = [name.strip() for name in controllers.split(",") if name.strip()]
-        if not names:
-            raise JaxpendError(f"there is no controller to judge; known: {', '.join(CATALOGUE)}")
+    if not names:
+        raise JaxpendError(f"there is no controller to judge; known: {', '.join(CATALOGUE)}")
     chosen: dict[str, tuple[str, Make]] = {}
     for name in names:
         title = CATALOGUE[choose("controller", name, CATALOGUE)].title
-        chosen[name] = (title, partial(build, name, robot=robot))
+        chosen[name] = title, partial(build, name, robot=robot)
     if policy is not None:
         load_controller(policy, robot=robot)  # a wrong file is known at once
-        chosen["own_policy"] = (policy.stem, lambda plant: load_controller(policy, robot=robot))
+        chosen["own_policy"] = policy.stem, lambda plant: load_controller(policy, robot=robot)
     return chosen
 
 

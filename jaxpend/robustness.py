@@ -23,7 +23,7 @@ from .boards import CRITERIA, Board, Strip, board, strips
 from .controller import Controller, check_robot
 from .errors import JaxpendError, choose
 from .plant import Plant
-from .scenario import DT, Pulses, Scenario
+from .scenario import DT, Scenario, with_neutral
 from .sweep import at_least_one, compile_sweep, survey, sweep
 from .variations import INERTIAL, RANGES, VARIATIONS, vary
 
@@ -94,26 +94,8 @@ def _base(nominal: Scenario, strips: Iterable[Strip]) -> Scenario:
     cost a run is little beside what six programs cost to compile.
     """
 
-    def full(value: float, *shape: int) -> Any:
-        return np.full(shape, value, nominal.dtype)
-
-    neutral = {
-        "delay": np.zeros(4, "i4"),
-        "responsiveness": full(1),
-        "measurement_noise": full(0, 4),
-        "torque_noise": full(0, 2),
-        "process_noise": full(0, 4),
-        "pulses": Pulses(full(0, 2, 3), full(1, 2, 3), full(0, 2, 3)),
-    }
-    names = {strip.variation for strip in strips}
-    fields = {"velocity_delay": "delay", "perturbation": "pulses"}
-    fields |= dict.fromkeys(("velocity_noise", "position_noise"), "measurement_noise")
-    varied = neutral.keys() & {fields.get(name, name) for name in names}
-    absent = {field: neutral[field] for field in varied if getattr(nominal, field) is None}
-    base = nominal.replace(**absent)
-    if base.plant.coulomb_friction is None and {"cf1", "cf2"} & names:
-        base = base.replace(plant=base.plant.replace(coulomb_friction=full(0, 2)))
-    return base
+    varied = {VARIATIONS[strip.variation].field for strip in strips}
+    return with_neutral(nominal, varied)
 
 
 def _scenarios(base: Scenario, strips: Iterable[Strip], key: jax.Array, dt: float) -> Scenario:
@@ -182,7 +164,8 @@ def benchmark(
         keys: how often what draws something (noise, disturbances) is repeated; what is reported
             is the median.
         grids: other strips than the official ones, of any criteria and variations.
-        **options: of ``sweep``; the perturbations need 10 s.
+        **options: of ``sweep``; time grid and score are those of a board unless given here. The
+            perturbations need 10 s.
 
     Raises:
         JaxpendError: fewer than one key, no strips, a controller of the other robot, or as
@@ -193,7 +176,10 @@ def benchmark(
     if isinstance(judged_on, Board | str):
         official = board(judged_on)
         check_robot(controller, official.robot)
-        judged_on, trials = official.task.plant, official.trials
+        task, trials = official.task, official.trials
+        grid = {"dt": task.dt, "duration": task.duration}
+        options = grid | {"scoring": task.scoring, "height": task.height} | options
+        judged_on = task.plant
     nominal = Scenario(judged_on) if isinstance(judged_on, Plant) else judged_on
     named = _named(trials(nominal.plant) if grids is None else grids)
     rows: dict[bool, dict[str, Strip]] = {False: {}, True: {}}

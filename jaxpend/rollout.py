@@ -176,25 +176,24 @@ def rollout(
     return _closed_loop(scenario, controller, key, *options, normals, record=True)
 
 
-DEFAULTS: dict[str, Any] = {
-    "dt": DT,
-    "duration": DURATION,
-    "integrator": rk4_step,
-    "delay_slots": 32,
-}
-_final_state = jax.jit(_closed_loop, static_argnames=tuple(DEFAULTS))
+_final_state = jax.jit(
+    _closed_loop, static_argnames=("dt", "duration", "integrator", "delay_slots")
+)
 
 
 def final_state(
-    scenario: Scenario | Plant, controller: Controller, key: jax.Array, **options: Any
+    scenario: Scenario | Plant,
+    controller: Controller,
+    key: jax.Array,
+    *,
+    dt: float = DT,
+    duration: float = DURATION,
+    integrator: Callable = rk4_step,
+    delay_slots: int = 32,
 ) -> jax.Array:
-    """Only the last true state of ``rollout``, shape (4,): no trajectory is kept in memory.
-
-    ``options`` and their defaults are those of ``rollout``, without ``normals``.
-    """
-    options = DEFAULTS | options
-    scenario = _check(scenario, controller, options["delay_slots"])
-    return _final_state(scenario, controller, key, **options)
+    """Only the last true state of ``rollout``, shape (4,): no trajectory is kept in memory."""
+    scenario = _check(scenario, controller, delay_slots)
+    return _final_state(scenario, controller, key, dt, duration, integrator, delay_slots)
 
 
 class _Rollout(types.ModuleType):

@@ -4,7 +4,8 @@ An imperfection that is ``None`` is left out of the compiled program, so the nom
 costs nothing; one that is an array may differ per rollout under ``jax.vmap``.
 """
 
-import math
+from collections.abc import Collection
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,10 @@ from .errors import JaxpendError, choose
 from .plant import Plant
 from .pytree import Pytree, pytree
 
-__all__ = ["DT", "DURATION", "Pulses", "Scenario", "check_values", "delay_steps", "random_pulses"]
+__all__ = [
+    "DT", "DURATION", "NEUTRAL", "Pulses", "Scenario", "check_values", "delay_steps",
+    "random_pulses", "with_neutral",
+]  # fmt: skip
 
 # Of the boards, and of everything here that does not say otherwise, s.
 DT = 0.002  # control and integration period
@@ -71,30 +75,70 @@ def delay_steps(delay: float, dt: float = DT, mode: str = "posvel") -> np.ndarra
     return int(delay / dt) * np.array(lagging[choose("delay mode", mode, lagging)])
 
 
-# Random pulses of the benchmark: (joints, pulses on each), the least distance in s between any
-# two centres and from the start, ranges of the standard deviation in s and the amplitude in N m.
-PULSES, DISTANCE, WIDTH, AMPLITUDE = (2, 3), 1.0, (0.05, 0.1), (0.5, 5.0)
+def random_pulses(
+    key: jax.Array,
+    *,
+    duration: float = DURATION,
+    per_joint: int = 3,
+    distance: float = 1.0,
+    width: tuple[float, float] = (0.05, 0.1),
+    amplitude: tuple[float, float] = (0.5, 5.0),
+) -> Pulses:
+    """Random disturbance pulses, distributed as in the RealAIGym robustness benchmark.
 
+    Args:
+        key: consumed.
+        duration: s, of the run.
+        per_joint: pulses on each joint.
+        distance: s, the least one between any two centres, and from the start.
+        width: s, range of the (uniform) standard deviations.
+        amplitude: N m, range of the (uniform) amplitudes; the sign is a coin's.
 
-def random_pulses(key: jax.Array, *, duration: float = DURATION) -> Pulses:
-    """Three pulses on each joint, as random as in the RealAIGym robustness benchmark.
-
-    ``key`` is consumed, ``duration`` (s) is that of the run. Raises ``JaxpendError`` if the pulses
-    do not fit into it.
+    Raises:
+        JaxpendError: more pulses than fit into the duration.
     """
-    n = math.prod(PULSES)
-    slack = (duration - (n + 1) * DISTANCE) / n
+    n = 2 * per_joint
+    slack = (duration - (n + 1) * distance) / n
     if slack < 0:
-        raise JaxpendError(f"{n} pulses {DISTANCE} s apart do not fit into {duration} s")
+        raise JaxpendError(f"{n} pulses {distance} s apart do not fit into {duration} s")
     wait_key, joint_key, width_key, amplitude_key = jax.random.split(key, 4)
-    centres = jnp.cumsum(DISTANCE + slack * jax.random.uniform(wait_key, (n,)))
-    span = AMPLITUDE[1] - AMPLITUDE[0]
-    offset = jax.random.uniform(amplitude_key, PULSES, minval=-span, maxval=span)
+    centres = jnp.cumsum(distance + slack * jax.random.uniform(wait_key, (n,)))
+    shape = (2, per_joint)
+    span = amplitude[1] - amplitude[0]
+    offset = jax.random.uniform(amplitude_key, shape, minval=-span, maxval=span)
     return Pulses(
-        time=jax.random.permutation(joint_key, centres).reshape(PULSES),
-        width=jax.random.uniform(width_key, PULSES, minval=WIDTH[0], maxval=WIDTH[1]),
-        amplitude=offset + AMPLITUDE[0] * jnp.sign(offset),
+        time=jax.random.permutation(joint_key, centres).reshape(shape),
+        width=jax.random.uniform(width_key, shape, minval=width[0], maxval=width[1]),
+        amplitude=offset + amplitude[0] * jnp.sign(offset),
     )
+
+
+# What an imperfection that is there has no effect with; all that is missing has a place here.
+NEUTRAL: dict[str, Any] = {
+    "delay": np.zeros(4, "i4"),
+    "responsiveness": np.ones(()),
+    "measurement_noise": np.zeros(4),
+    "torque_noise": np.zeros(2),
+    "process_noise": np.zeros(4),
+    "pulses": Pulses(np.zeros((2, 3)), np.ones((2, 3)), np.zeros((2, 3))),  # type: ignore[arg-type]
+}
+
+
+def with_neutral(scenario: Scenario, fields: Collection[str]) -> Scenario:
+    """The scenario with its neutral value in each of the fields that is ``None``.
+
+    "coulomb_friction" is that of the plant; names of other things than imperfections are ignored.
+    """
+    plant, dtype = scenario.plant, scenario.dtype
+
+    def cast(leaf):
+        return leaf.astype(dtype) if leaf.dtype.kind == "f" else leaf
+
+    absent = [name for name in NEUTRAL if name in fields and getattr(scenario, name) is None]
+    scenario = scenario.replace(**{n: jax.tree.map(cast, NEUTRAL[n]) for n in absent})
+    if "coulomb_friction" in fields and plant.coulomb_friction is None:
+        scenario = scenario.replace(plant=plant.replace(coulomb_friction=np.zeros(2, dtype)))
+    return scenario
 
 
 def check_values(scenario: Scenario) -> None:
@@ -106,8 +150,7 @@ def check_values(scenario: Scenario) -> None:
     """
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(scenario)):
         return
-    names = ("measurement_noise", "delay", "process_noise", "torque_noise", "responsiveness")
-    scales = {name: getattr(scenario, name) for name in names}
+    scales = {name: getattr(scenario, name) for name in NEUTRAL if name != "pulses"}
     scales["torque_limit"] = scenario.plant.torque_limit
     scales["pulse width"] = None if scenario.pulses is None else scenario.pulses.width
     for name, value in scales.items():

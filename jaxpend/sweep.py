@@ -5,7 +5,7 @@ time and not by memory. Only final states leave it, and scores if asked for.
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .controller import Controller, check_controller
-from .criteria import EPSILON, criteria, score_v2, upright
+from .criteria import EPSILON, HEIGHT, Criteria, criteria, score_v2, upright
 from .errors import JaxpendError
 from .plant import Plant
 from .pytree import Pytree, pytree
@@ -38,16 +38,16 @@ class Outcome(Pytree):
     score: jax.Array | None = None  # (n,) v2 score; 0 where its own rule of success is not met
 
 
-@partial(jax.jit, static_argnames=("scored", "dt", "duration", "delay_slots"))
-def _run(scenarios, controller, keys, *, scored, duration, **options):
+@partial(jax.jit, static_argnames=("scoring", "height", "dt", "duration", "delay_slots"))
+def _run(scenarios, controller, keys, *, scoring, height, duration, **options):
     """One chunk."""
 
     def one(scenario, key):
-        if not scored:
+        if scoring is None:
             return final_state(scenario, controller, key, duration=duration, **options), None
         run = rollout(scenario, controller, key, duration=duration, **options)
-        c = criteria(run.t, run.x, run.u, scenario.plant, t_final=duration)
-        return run.x[-1], score_v2(c)
+        c = criteria(run.t, run.x, run.u, scenario.plant, height=height, t_final=duration)
+        return run.x[-1], scoring(c)
 
     x, score = jax.vmap(one)(scenarios, keys)
     return Outcome(x, upright(x), ~jnp.all(jnp.isfinite(x), axis=-1), score)
@@ -77,18 +77,33 @@ def at_least_one(**counts: int) -> None:
             raise JaxpendError(f"{name} is {count}; it must be at least 1")
 
 
-def _plan(scenarios, key, scored=False, dt=DT, duration=DURATION, chunk=None):
-    """Pieces (scenarios, keys) for ``_run``, and its static arguments; ``sweep``'s defaults."""
+def _plan(
+    scenarios, key, *, scored=False, scoring=score_v2, height=HEIGHT, dt=DT, duration=DURATION,
+    chunk=None,
+):  # fmt: skip
+    """Pieces (scenarios, keys) for ``_run``, and its static arguments; options as in ``sweep``."""
     size = (512 if scored else 4096) if chunk is None else chunk
     at_least_one(chunk=size)
     # The buffer is as long as the longest delay needs.
     longest = 0 if scenarios.delay is None else int(np.max(scenarios.delay))
-    static = {"scored": scored, "dt": dt, "duration": duration, "delay_slots": longest + 1}
+    static = {"dt": dt, "duration": duration, "delay_slots": longest + 1}
+    static |= {"scoring": scoring, "height": height} if scored else {"scoring": None, "height": 0}
     keys = jax.random.split(key, len(scenarios.plant.mass))
     return _chunks(_lean(scenarios), keys, size), static
 
 
-def sweep(scenarios: Scenario, controller: Controller, key: jax.Array, **options: Any) -> Outcome:
+def sweep(
+    scenarios: Scenario,
+    controller: Controller,
+    key: jax.Array,
+    *,
+    scored: bool = False,
+    scoring: Callable[[Criteria], jax.Array] = score_v2,
+    height: float = HEIGHT,
+    dt: float = DT,
+    duration: float = DURATION,
+    chunk: int | None = None,
+) -> Outcome:
     """Run one controller on a batch of scenarios.
 
     A rollout that diverges is a failure, flagged as diverged, and touches no other.
@@ -97,9 +112,10 @@ def sweep(scenarios: Scenario, controller: Controller, key: jax.Array, **options
         scenarios: every leaf with a leading axis of n, as ``vary`` makes them.
         controller: one for all.
         key: split once per rollout, whatever the chunk, so chunking changes nothing.
-        **options: ``scored`` (False): the v2 performance score as well, which keeps a chunk of
-            trajectories in memory. ``dt`` and ``duration``: s, by default those of the boards.
-            ``chunk``: rollouts at a time, by default 4096, or 512 when scored.
+        scored: the performance score as well, which keeps a chunk of trajectories in memory.
+        scoring, height: of that score, as in a ``Task``.
+        dt, duration: s.
+        chunk: rollouts at a time; by default 4096, or 512 when scored.
 
     Returns:
         The outcome with numpy arrays, n long.
@@ -110,13 +126,18 @@ def sweep(scenarios: Scenario, controller: Controller, key: jax.Array, **options
     """
     check_values(scenarios)
     check_controller(controller)
-    pieces, static = _plan(scenarios, key, **options)
+    pieces, static = _plan(
+        scenarios, key, scored=scored, scoring=scoring, height=height, dt=dt, duration=duration,
+        chunk=chunk,
+    )  # fmt: skip
     outcomes = [_run(piece, controller, keys, **static) for piece, keys in pieces]
     n = len(scenarios.plant.mass)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:n], *outcomes)
 
 
-def compile_sweep(scenarios: Scenario, controller: Controller, key: jax.Array, **options: Any):
+def compile_sweep(
+    scenarios: Scenario, controller: Controller, key: jax.Array, **options: Any
+) -> None:
     """Compile what ``sweep`` with the same arguments runs."""
     check_controller(controller)
     pieces, static = _plan(scenarios, key, **options)

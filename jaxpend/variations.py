@@ -34,6 +34,7 @@ class Variation:
     """One thing that can be wrong, and how."""
 
     apply: Apply
+    field: str  # of a ``Scenario``, or of its plant, that it changes
     title: str
     unit: str
     least: float = -np.inf  # values below make no sense
@@ -41,7 +42,10 @@ class Variation:
     draws: bool = False  # whether a run of it depends on a key
 
 
-def _plant(field: str, index: int | None = None, per: tuple[str, int] | None = None) -> Apply:
+def _plant(
+    title: str, unit: str, field: str, index: int | None = None, *,
+    per: tuple[str, int] | None = None, least: float = -np.inf,
+) -> Variation:  # fmt: skip
     """Set an entry of a plant's field to the value, or to the value over another entry."""
 
     def apply(scenario, values, keys):
@@ -53,10 +57,10 @@ def _plant(field: str, index: int | None = None, per: tuple[str, int] | None = N
         changed[... if index is None else (slice(None), index)] = values
         return scenario.replace(plant=plant.replace(**{field: changed}))
 
-    return apply
+    return Variation(apply, field, title, unit, least)
 
 
-def _noise(field: str, entries: list[int]) -> Apply:
+def _noise(title: str, unit: str, field: str, entries: list[int]) -> Variation:
     """Set entries of one of the (4,) standard deviations to the value, keeping the others."""
 
     def apply(scenario, values, keys):
@@ -65,7 +69,7 @@ def _noise(field: str, entries: list[int]) -> Apply:
         changed[:, entries] = values[:, None]
         return scenario.replace(**{field: changed})
 
-    return apply
+    return Variation(apply, field, title, unit, 0, draws=True)
 
 
 def _torque_noise(scenario, values, keys):
@@ -78,7 +82,7 @@ def _responsiveness(scenario, values, keys):
     return scenario.replace(responsiveness=values.astype(scenario.dtype))
 
 
-def _delay(lagging: list[int]) -> Apply:
+def _delay(title: str, lagging: list[int]) -> Variation:
     """Let some of the measured components lag by at least so many steps."""
 
     def apply(scenario, values, keys):
@@ -87,7 +91,7 @@ def _delay(lagging: list[int]) -> Apply:
             delay = np.maximum(delay, scenario.delay)
         return scenario.replace(delay=delay)
 
-    return apply
+    return Variation(apply, "delay", title, "s", 0, in_steps=True)
 
 
 _many_pulses = jax.jit(jax.vmap(random_pulses))
@@ -117,34 +121,28 @@ LONGEST_DELAY = round(RANGES["delay"][1] / DT)  # steps
 
 
 VARIATIONS: dict[str, Variation] = {
-    "Ir": Variation(_plant("motor_inertia"), "motor inertia", "kg m²", 0),
-    "m1r1": Variation(_plant("com", 0, per=("mass", 0)), "m₁ r₁", "kg m"),
-    "I1": Variation(_plant("inertia", 0), "I₁", "kg m²"),
-    "b1": Variation(_plant("damping", 0), "damping 1", "N m s/rad"),
-    "cf1": Variation(_plant("coulomb_friction", 0), "friction 1", "N m"),
-    "m2r2": Variation(_plant("com", 1, per=("mass", 1)), "m₂ r₂", "kg m"),
-    "m2": Variation(_plant("mass", 1), "m₂", "kg", 0),
-    "I2": Variation(_plant("inertia", 1), "I₂", "kg m²"),
-    "b2": Variation(_plant("damping", 1), "damping 2", "N m s/rad"),
-    "cf2": Variation(_plant("coulomb_friction", 1), "friction 2", "N m"),
-    "m1": Variation(_plant("mass", 0), "m₁", "kg", 0),
-    "l1": Variation(_plant("length", 0), "l₁", "m", 0),
-    "l2": Variation(_plant("length", 1), "l₂", "m", 0),
-    "gravity": Variation(_plant("gravity"), "gravity", "m/s²"),
-    "velocity_noise": Variation(
-        _noise("measurement_noise", [2, 3]), "velocity noise", "rad/s", 0, draws=True
-    ),
-    "position_noise": Variation(
-        _noise("measurement_noise", [0, 1]), "position noise", "rad", 0, draws=True
-    ),
-    "process_noise": Variation(
-        _noise("process_noise", [0, 1, 2, 3]), "process noise", "rad, rad/s", 0, draws=True
-    ),
-    "torque_noise": Variation(_torque_noise, "torque noise", "N m", 0, draws=True),
-    "responsiveness": Variation(_responsiveness, "torque response", "", 0),
-    "delay": Variation(_delay([1, 1, 1, 1]), "delay", "s", 0, in_steps=True),
-    "velocity_delay": Variation(_delay([0, 0, 1, 1]), "velocity delay", "s", 0, in_steps=True),
-    "perturbation": Variation(_perturbation, "perturbation strength", "", 0, draws=True),
+    "Ir": _plant("motor inertia", "kg m²", "motor_inertia", least=0),
+    "m1r1": _plant("m₁ r₁", "kg m", "com", 0, per=("mass", 0)),
+    "I1": _plant("I₁", "kg m²", "inertia", 0),
+    "b1": _plant("damping 1", "N m s/rad", "damping", 0),
+    "cf1": _plant("friction 1", "N m", "coulomb_friction", 0),
+    "m2r2": _plant("m₂ r₂", "kg m", "com", 1, per=("mass", 1)),
+    "m2": _plant("m₂", "kg", "mass", 1, least=0),
+    "I2": _plant("I₂", "kg m²", "inertia", 1),
+    "b2": _plant("damping 2", "N m s/rad", "damping", 1),
+    "cf2": _plant("friction 2", "N m", "coulomb_friction", 1),
+    "m1": _plant("m₁", "kg", "mass", 0, least=0),
+    "l1": _plant("l₁", "m", "length", 0, least=0),
+    "l2": _plant("l₂", "m", "length", 1, least=0),
+    "gravity": _plant("gravity", "m/s²", "gravity"),
+    "velocity_noise": _noise("velocity noise", "rad/s", "measurement_noise", [2, 3]),
+    "position_noise": _noise("position noise", "rad", "measurement_noise", [0, 1]),
+    "process_noise": _noise("process noise", "rad, rad/s", "process_noise", [0, 1, 2, 3]),
+    "torque_noise": Variation(_torque_noise, "torque_noise", "torque noise", "N m", 0, draws=True),
+    "responsiveness": Variation(_responsiveness, "responsiveness", "torque response", "", 0),
+    "delay": _delay("delay", [1, 1, 1, 1]),
+    "velocity_delay": _delay("velocity delay", [0, 0, 1, 1]),
+    "perturbation": Variation(_perturbation, "pulses", "perturbation strength", "", 0, draws=True),
 }
 
 

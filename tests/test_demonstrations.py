@@ -13,7 +13,8 @@ from jaxpend import JaxpendError
 from jaxpend.boards import v2
 from jaxpend.controllers import Feedback, Zero
 from jaxpend.env import Env, EnvConfig
-from jaxpend.sac import Agent, SACConfig, init, structure
+from jaxpend.sac import Agent, SACConfig, init
+from jaxpend.sac.algorithm import structure
 from jaxpend.sac.demonstrations import DemonstrationConfig, collect, imitate, imitation, swingups
 from jaxpend.sac.networks import Actor, to_policy
 from jaxpend.sac.replay import Replay

@@ -1,6 +1,7 @@
 """The robustness benchmark: its grids, its rules, and what can go wrong with a sweep."""
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
 
@@ -12,11 +13,12 @@ from conftest import assert_close, both_robots, excerpt, refused, task_of
 from test_policy import random_policy
 
 from jaxpend import Scenario, cli, load_policy, save_policy
-from jaxpend.boards import v2
+from jaxpend.boards import Board, v2
 from jaxpend.cli import commands
 from jaxpend.controllers import Feedback, Zero
 from jaxpend.controllers.callback import PythonLaw
 from jaxpend.controllers.catalogue import find_controller
+from jaxpend.criteria import ScoreV3
 from jaxpend.designs import competition
 from jaxpend.robustness import CRITERIA, Strip, benchmark, passes, strips
 from jaxpend.scenario import delay_steps, random_pulses
@@ -392,3 +394,18 @@ def test_grids_of_ones_own():
 def test_senseless_grids_are_one_sentence(call, words):
     with refused(words):
         call()
+
+
+def test_a_board_gives_its_time_grid_and_its_score():
+    task = dataclasses.replace(v2("pendubot").task, duration=SHORT, scoring=ScoreV3(SHORT))
+    board = Board("short", task, trials=lambda plant: [Strip("model", "m2", np.array([0.6, 0.7]))])
+    standing = Scenario(task.plant, x0=LEANING)
+    options = {"grids": board.trials(task.plant), "scored": True, "duration": SHORT}
+    expected = benchmark(BALANCE, standing, KEY, scoring=ScoreV3(SHORT), **options)
+    np.testing.assert_allclose(expected.performance["m2"], 1.0, atol=0.01)
+    found = benchmark(BALANCE, board, KEY, scored=True)
+    assert (found.overall, found.simulations) == (0.0, 2)  # it hangs for so short a time
+    np.testing.assert_array_equal(found.performance["m2"], 0.0)
+    # 10 s would be enough to fall out of the time grid: the score is that of the board, too.
+    with_v2 = benchmark(BALANCE, standing, KEY, **options)
+    assert np.all(with_v2.performance["m2"] < 1.0)

@@ -14,11 +14,11 @@ import pytest
 from conftest import assert_close, refused
 
 from jaxpend.boards import v2
+from jaxpend.config import SACConfig
 from jaxpend.env import EnvConfig, EnvState
 from jaxpend.sac import algorithm as sac
 from jaxpend.sac import losses
 from jaxpend.sac import replay as buffer
-from jaxpend.sac.algorithm import SACConfig
 from jaxpend.sac.networks import constant_log_std
 from jaxpend.sac.replay import Replay, Transition
 

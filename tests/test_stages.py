@@ -18,6 +18,7 @@ from jaxpend.gradient import Gradient
 from jaxpend.pytree import Pytree, pytree
 from jaxpend.report import page
 from jaxpend.runs.reader import find, listing, remarks
+from jaxpend.sac.stage import chunk_length
 from jaxpend.score import Criteria, nominal, score_v2
 from jaxpend.snes import SNES
 from jaxpend.train import train
@@ -199,3 +200,12 @@ def test_a_plant_file_that_has_changed_makes_another_run(tmp_path):
     moved.write_text(json.dumps(parameters | {name: 2 * parameters[name]}))
     with refused(f"{folder} holds a run with plant.{name} {parameters[name]}, not"):
         train(dataclasses.replace(run, plant=str(moved)), kinds=(Shrinking,))
+
+
+def test_chunks_are_of_one_length_where_they_can_be():
+    assert chunk_length(12_500, 781) == 625  # the shipped recipes: not 781 and a rest of four
+    assert chunk_length(18_750, 250) == 250
+    assert chunk_length(12, 4) == 4
+    assert chunk_length(3, 8) == 8  # less than a chunk in all: ``advance`` makes it shorter
+    assert chunk_length(10_007, 100) == 100  # a prime: the last one is shorter
+    assert chunk_length(5, 1) == 1

@@ -30,7 +30,7 @@ class Command:
 COMMANDS = {
     "train": Command(
         "train a policy",
-        "SAC, then SNES, then the official score",
+        "imitation, SAC and SNES by a recipe; ends with the official score",
         "--config pendubot --seed 1",
     ),
     "sac": Command(
@@ -60,7 +60,7 @@ COMMANDS = {
     ),
     "leaderboard": Command(
         "judge a controller",
-        "every known controller on both boards, next to the published rows",
+        "every known controller on the board of a robot, next to the published rows",
         "--robot acrobot --no-robustness",
     ),
     "runs": Command(

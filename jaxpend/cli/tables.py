@@ -114,11 +114,12 @@ def runs_table(entries: Sequence[Mapping[str, Any]]) -> None:
     rows = [_row(run) for run in entries]
     columns = list(zip(HEADINGS_OF_RUNS, *rows, strict=True))
     widths, room = [max(map(len, cells)) for cells in columns], console.width - 2 * len(columns) + 2
-    if sum(widths) > room:
-        # Cells break between words; the name of a run, which is copied, gets what is left.
-        for place in map(HEADINGS_OF_RUNS.index, ("stages", "state", "date")):
+    # Where there is no room, cells break between words; the name of a run, which is there to be
+    # copied, gets what is left.
+    for place in map(HEADINGS_OF_RUNS.index, ("date", "state", "stages")):
+        if sum(widths) > room:
             widths[place] = max(map(len, " ".join(columns[place]).split()))
-        widths[0] = max(min(widths[0], room - sum(widths[1:])), 8)
+    widths[0] = max(min(widths[0], room - sum(widths[1:])), 8)
     for heading, width in zip(HEADINGS_OF_RUNS, widths, strict=True):
         right = heading in ("score", "time")
         justify: Literal["left", "right"] = "right" if right else "left"

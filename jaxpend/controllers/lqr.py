@@ -74,7 +74,7 @@ def lqr(
     plant: Plant,
     robot: str,
     *,
-    q: tuple = DEFAULT_Q,
+    q: tuple[float, ...] = DEFAULT_Q,
     r: float = DEFAULT_R,
     dt: float | None = 0.002,
 ) -> LQR:

@@ -47,7 +47,7 @@ class Riccati(Pytree):
 
 
 def riccati(
-    plant: Plant, reference: Reference, *, q: tuple = DEFAULT_Q, r: float = DEFAULT_R
+    plant: Plant, reference: Reference, *, q: tuple[float, ...] = DEFAULT_Q, r: float = DEFAULT_R
 ) -> Riccati:
     """The controller along ``reference``; ``q`` and ``r`` are those of the LQR at its end.
 

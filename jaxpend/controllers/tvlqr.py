@@ -65,7 +65,7 @@ def _riccati(plant: Plant, reference: Reference, q: jax.Array, r: float, p_end: 
 
 
 def along(
-    plant: Plant, reference: Reference, *, q: tuple = DEFAULT_Q, r: float = DEFAULT_R
+    plant: Plant, reference: Reference, *, q: tuple[float, ...] = DEFAULT_Q, r: float = DEFAULT_R
 ) -> tuple[jax.Array, jax.Array, LQR]:
     """Gains (N, 4), costs-to-go (N, 4, 4) and the LQR at the end, of the tracking problem.
 

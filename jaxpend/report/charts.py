@@ -58,34 +58,40 @@ def _goals(x: np.ndarray) -> tuple[float, float]:
     return np.pi + turn1 * full, turn2 * full
 
 
-def _time_axis(axes, end: float, up: float | None, label: bool = False) -> None:
+def _over_time(axes, title: str, ylabel: str, end: float, up: float | None) -> None:
     """Time from 0 to ``end`` s, with a line where the swing-up is done."""
-    axes.set_xlim(0, end)
+    axes.set_title(title)
+    axes.set_ylabel(ylabel)
     axes.set_xlabel("time [s]")
+    axes.set_xlim(0, end)
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     if up is not None:
         axes.axvline(up, color=PALETTE["ink"], linewidth=1, linestyle=(0, (1, 1.5)))
-        if label:
-            axes.annotate(
-                f"up at {up:.2f} s", (up, 0), xycoords=("data", "axes fraction"),
-                xytext=(5, 5), textcoords="offset points", va="bottom", fontsize=10,
-            )  # fmt: skip
 
 
-def _goal(axes, height: float, colour: str) -> None:
+def _goal(axes, height: float, colour: str, text: str = "") -> None:
+    """A dashed line across the axes, with what it is below its right end."""
     axes.axhline(height, color=PALETTE[colour], linewidth=1, linestyle=(0, (5, 3)), alpha=0.8)
+    if text:
+        axes.annotate(
+            text, (1, height), xycoords=("axes fraction", "data"), xytext=(0, -3),
+            textcoords="offset points", ha="right", va="top", fontsize=10, color=PALETTE[colour],
+        )  # fmt: skip
 
 
 def draw_angles(axes, t, x, end: float, up: float | None = None) -> None:
     """Both angles over time (n,), s, of states (n, 4), with the goal as dashed lines."""
-    shown = t <= end
+    shown, goals = t <= end, _goals(x)
     for joint, colour in enumerate(("one", "two")):
         axes.plot(t[shown], x[shown, joint], color=PALETTE[colour], label="θ" + "₁₂"[joint])
-        _goal(axes, _goals(x)[joint], colour)
-    _angle_axis(axes.yaxis, np.append(x[shown, :2], _goals(x)))
-    _time_axis(axes, end, up, label=True)
-    axes.set_ylabel("angle [rad]")
-    axes.set_title("Angles")
+        _goal(axes, goals[joint], colour)
+    _angle_axis(axes.yaxis, np.append(x[shown, :2], goals))
+    _over_time(axes, "Angles", "angle [rad]", end, up)
+    if up is not None:
+        axes.annotate(
+            f"up at {up:.2f} s", (up, 0), xycoords=("data", "axes fraction"),
+            xytext=(5, 5), textcoords="offset points", va="bottom", fontsize=10,
+        )  # fmt: skip
     _legend(axes)
 
 
@@ -95,27 +101,19 @@ def draw_velocities(axes, t, x, end: float, up: float | None = None) -> None:
     for joint, colour in enumerate(("one", "two")):
         axes.plot(t[shown], x[shown, 2 + joint], color=PALETTE[colour], label="ω" + "₁₂"[joint])
     _goal(axes, 0, "muted")
-    _time_axis(axes, end, up)
-    axes.set_ylabel("velocity [rad/s]")
-    axes.set_title("Velocities")
+    _over_time(axes, "Velocities", "velocity [rad/s]", end, up)
     _legend(axes)
 
 
 def draw_torque(axes, t, u, joint: int, limit: float, end: float, up: float | None = None) -> None:
     """Torque of the driven joint, N m, held between time stamps, with its limits dashed."""
-    shown = t[: len(u)] <= end
-    axes.step(t[: len(u)][shown], u[shown, joint], where="post", color=PALETTE["three"])
-    for side in (-limit, limit):
-        _goal(axes, side, "muted")
-    axes.annotate(
-        f"limit ±{limit:g} N m", (1, limit), xycoords=("axes fraction", "data"), ha="right",
-        xytext=(0, -3), textcoords="offset points", va="top", fontsize=10,
-        color=PALETTE["muted"],
-    )  # fmt: skip
+    held = t[: len(u)]
+    shown = held <= end
+    axes.step(held[shown], u[shown, joint], where="post", color=PALETTE["three"])
+    _goal(axes, -limit, "muted")
+    _goal(axes, limit, "muted", f"limit ±{limit:g} N m")
     axes.set_ylim(-1.12 * limit, 1.12 * limit)
-    _time_axis(axes, end, up)
-    axes.set_ylabel(f"torque τ{'₁₂'[joint]} [N m]")
-    axes.set_title("Torque")
+    _over_time(axes, "Torque", f"torque τ{'₁₂'[joint]} [N m]", end, up)
 
 
 def draw_height(
@@ -132,30 +130,20 @@ def draw_height(
     """
     shown = t <= end
     axes.plot(t[shown], y[shown], color=PALETTE["ink"])
-    _goal(axes, height * reach, "three")
-    axes.annotate(
-        f"{height:g} line", (1, height * reach), xycoords=("axes fraction", "data"),
-        ha="right", xytext=(0, -3), textcoords="offset points", va="top", fontsize=10,
-        color=PALETTE["three"],
-    )  # fmt: skip
+    _goal(axes, height * reach, "three", f"{height:g} line")
     axes.set_ylim(-1.12 * reach, 1.12 * reach)
-    _time_axis(axes, end, up)
-    axes.set_ylabel("height [m]")
-    axes.set_title("Height of the end effector")
+    _over_time(axes, "Height of the end effector", "height [m]", end, up)
 
 
 def draw_phase(axes, x, joint: int) -> None:
     """Velocity over angle of one joint, from rest to the goal."""
-    colour = PALETTE[("one", "two")[joint]]
-    axes.plot(x[:, joint], x[:, 2 + joint], color=colour, linewidth=1.4)
-    marks = {"marker": "o", "markersize": 8, "linestyle": "none", "markeredgewidth": 1.6}
-    axes.plot(x[0, joint], x[0, 2 + joint], color=PALETTE["ink"], label="start", **marks)
-    goal = _goals(x)[joint]
-    axes.plot(
-        goal, 0, color=PALETTE["ink"], markerfacecolor="none", label="goal",
-        **marks | {"markersize": 11},
-    )  # fmt: skip
-    _angle_axis(axes.xaxis, np.append(x[:, joint], goal))
+    angle, velocity, goal = x[:, joint], x[:, 2 + joint], _goals(x)[joint]
+    axes.plot(angle, velocity, color=PALETTE[("one", "two")[joint]], linewidth=1.4)
+    mark = {"color": PALETTE["ink"], "marker": "o", "linestyle": "none", "markeredgewidth": 1.6}
+    axes.plot(angle[0], velocity[0], label="start", markersize=6, **mark)
+    # The ring lies around the dot where start and goal are the same angle, as of joint 2.
+    axes.plot(goal, 0, label="goal", markersize=14, markerfacecolor="none", **mark)
+    _angle_axis(axes.xaxis, np.append(angle, goal))
     number = "₁₂"[joint]
     axes.set_xlabel(f"angle θ{number} [rad]")
     axes.set_ylabel(f"velocity ω{number} [rad/s]")
@@ -191,14 +179,11 @@ def _log_axis(axes) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
+Curves = Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]]
+
+
 def draw_curves(
-    axes,
-    title: str,
-    curves: Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]],
-    *,
-    xlabel: str,
-    ylabel: str = "",
-    log: bool = False,
+    axes, title: str, curves: Curves, *, xlabel: str, ylabel: str = "", log: bool = False
 ) -> None:
     """Learning curves: label -> for every seed what is on x and on y, each (n,).
 

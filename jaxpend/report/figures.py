@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from ..boards import CRITERIA
 from ..files import to_json, write_atomically
-from ..variations import VARIATIONS
+from ..variations import VARIATIONS, Variation
 
 __all__ = [
     "PALETTE",
@@ -30,7 +30,6 @@ __all__ = [
     "save",
     "stack",
     "strips_figure",
-    "styled",
     "svg",
     "write_robustness",
 ]
@@ -43,7 +42,7 @@ PALETTE = {
 }  # fmt: skip
 # From failure to success: dark red, pale, dark blue.
 COLOURS = "RdYlBu"
-STYLE = {
+STYLE: Any = {
     "axes.edgecolor": PALETTE["muted"], "axes.labelcolor": PALETTE["ink"],
     "axes.facecolor": "none", "axes.titlecolor": PALETTE["ink"], "axes.titlelocation": "left",
     "axes.titlesize": "medium", "axes.titleweight": "bold", "axes.labelsize": "medium",
@@ -58,13 +57,13 @@ STYLE = {
 styled = matplotlib.rc_context(STYLE)
 
 
-def save(figure: Figure, path: Path, dpi: int = 150) -> None:
+def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, atomically."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         # A name may have characters that the font does not have; boxes stand for them.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
-        figure.savefig(buffer, format="png", dpi=dpi)
+        figure.savefig(buffer, format="png", dpi=150)
     write_atomically(path, buffer.getvalue())
 
 
@@ -88,33 +87,40 @@ def svg(figure: Figure, name: str, label: str) -> str:
 
 
 @styled
-def panel(draw: Callable[..., Any], *data: Any, size: tuple[float, float] = (4.4, 2.9), **options):
-    """``draw(axes, *data, **options)`` alone on a figure of ``size``, inches."""
-    figure = Figure(figsize=size, layout="constrained")
-    draw(figure.add_subplot(), *data, **options)
-    return figure
-
-
-@styled
 def stack(
     draws: Sequence[Callable[..., Any]],
     columns: int = 1,
     size: tuple[float, float] = (4.4, 2.9),
     title: str = "",
 ) -> Figure:
-    """Charts in a grid on one figure, for a file; each is called with its axes."""
+    """Charts in a grid on one figure, each called with its axes; ``size`` of each in inches."""
     rows = -(-len(draws) // columns)
     figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
     for number, draw in enumerate(draws):
         draw(figure.add_subplot(rows, columns, number + 1))
-    figure.suptitle(title, fontweight="bold", parse_math=False)
+    if title:
+        figure.suptitle(title, fontweight="bold", parse_math=False)
     return figure
+
+
+def panel(draw: Callable[..., Any], *data: Any, **options: Any) -> Figure:
+    """``draw(axes, *data, **options)`` alone on a figure."""
+    return stack([lambda axes: draw(axes, *data, **options)])
 
 
 # --- robustness ----------------------------------------------------------------------------
 
 
-def _bars(axes, result: dict[str, Any], first: bool) -> None:
+def _grids(result: dict[str, Any]) -> list[tuple[str, str, Variation, dict[str, Any]]]:
+    """Every grid of a result: its criterion, its name, what it varies, and the grid itself."""
+    return [
+        (criterion, name, VARIATIONS[grid.get("variation", name)], grid)
+        for criterion, found in result["criteria"].items()
+        for name, grid in found["grids"].items()
+    ]
+
+
+def _bars(axes, result: dict[str, Any]) -> None:
     """The six scores and the overall one: medians over keys, with the range as whiskers."""
     over, scores = result["over_keys"], result["scores"]
     names = list(reversed(scores))
@@ -126,14 +132,14 @@ def _bars(axes, result: dict[str, Any], first: bool) -> None:
     for y, (value, spread) in enumerate(zip(values, ranges, strict=True)):
         if len(spread) > 1:
             axes.plot([min(spread), max(spread)], [y, y], color="#e69f00", linewidth=2)
-        end = max([value, *spread])
-        inside = end > 0.85
+        low, high = min(value, *spread), max(value, *spread)
+        inside = high > 0.85
         axes.text(
-            min(value, min(spread)) - 0.015 if inside else end + 0.015, y, f"{100 * value:.1f}",
+            low - 0.015 if inside else high + 0.015, y, f"{100 * value:.1f}",
             va="center", ha="right" if inside else "left",
             color=PALETTE["paper" if inside else "ink"],
         )  # fmt: skip
-    axes.set_yticks(range(len(titles)), titles if first else [""] * len(titles))
+    axes.set_yticks(range(len(values)), titles)
     axes.tick_params(axis="y", length=0)
     axes.set_xlim(0, 1)
     axes.set_xticks([0, 0.5, 1], ["0", "50", "100 %"])
@@ -141,48 +147,39 @@ def _bars(axes, result: dict[str, Any], first: bool) -> None:
     axes.set_title(result["robot"], loc="center")
 
 
-def _strips(axes, result: dict[str, Any], first: bool, margin: float = 0.18) -> Any:
+def _strips(axes, result: dict[str, Any], margin: float = 0.18) -> Any:
     """One row a grid: every value coloured by the fraction of the first key's runs that succeed.
 
     ``margin`` is the room for the ends of a grid, in widths of a row.
     """
-    rows = [
-        (grid.get("variation", name), grid)
-        for criterion in result["criteria"].values()
-        for name, grid in criterion["grids"].items()
-    ]
-    for y, (name, grid) in enumerate(rows):
+    small = {"va": "center", "fontsize": 9, "color": PALETTE["muted"]}
+    labels = []
+    for y, (_, _, variation, grid) in enumerate(_grids(result)):
         success, values = np.array(grid["success"]), grid["values"]
-        random_series = name == "perturbation"
-        success = np.sort(success)[::-1] if random_series else success
+        first, last = f"{values[0]:.3g}", f"{values[-1]:.3g}"
+        if variation is VARIATIONS["perturbation"]:  # random series, in no order
+            success, first, last = np.sort(success)[::-1], "", f"{len(values)} series"
         image = axes.imshow(
             success[None], extent=(0, 1, y + 0.42, y - 0.42), aspect="auto", cmap=COLOURS,
             vmin=0, vmax=1, interpolation="nearest",
         )  # fmt: skip
-        ends = (
-            ("", f"{len(values)} series")
-            if random_series
-            else (f"{values[0]:.3g}", f"{values[-1]:.3g}")
-        )
-        small = {"va": "center", "fontsize": 9, "color": PALETTE["muted"]}
-        axes.text(-0.015, y, ends[0], ha="right", **small)
-        axes.text(1.015, y, ends[1], ha="left", **small)
+        axes.text(-0.015, y, first, ha="right", **small)
+        axes.text(1.015, y, last, ha="left", **small)
+        labels.append(_label(variation))
     axes.set_xlim(-margin, 1 + 1.1 * margin)
-    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.set_ylim(len(labels) - 0.5, -0.5)
     axes.set_xticks([])
-    labels = [_label(name) for name, _ in rows]
-    axes.set_yticks(range(len(rows)), labels if first else [""] * len(rows))
+    axes.set_yticks(range(len(labels)), labels)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
     axes.grid(False)
     return image
 
 
-def _label(name: str) -> str:
-    kind = VARIATIONS[name]
-    if name == "perturbation":
+def _label(variation: Variation) -> str:
+    if variation is VARIATIONS["perturbation"]:
         return "perturbations"
-    return f"{kind.title} [{kind.unit}]" if kind.unit else kind.title
+    return f"{variation.title} [{variation.unit}]" if variation.unit else variation.title
 
 
 def _success_bar(figure: Figure, image) -> None:
@@ -197,11 +194,10 @@ def robustness_figure(results: Sequence[dict[str, Any]]) -> Figure:
     ``results`` are ``Report.as_dict()`` with the name of the ``robot`` added.
     """
     figure = Figure(figsize=(3.2 + 4.4 * len(results), 9), layout="constrained")
-    grid = figure.add_gridspec(2, len(results), height_ratios=[1, 2.2])
-    for column, result in enumerate(results):
-        _bars(figure.add_subplot(grid[0, column]), result, first=column == 0)
-        axes = figure.add_subplot(grid[1, column])
-        image = _strips(axes, result, first=column == 0)
+    axes = figure.subplots(2, len(results), sharey="row", squeeze=False, height_ratios=[1, 2.2])
+    for result, (upper, lower) in zip(results, axes.T, strict=True):
+        _bars(upper, result)
+        image = _strips(lower, result)
     _success_bar(figure, image)
     return figure
 
@@ -210,7 +206,7 @@ def robustness_figure(results: Sequence[dict[str, Any]]) -> Figure:
 def strips_figure(result: dict[str, Any]) -> Figure:
     """Success along every grid of one result, no wider than a phone."""
     figure = Figure(figsize=(4.4, 6), layout="constrained")
-    _success_bar(figure, _strips(figure.add_subplot(), result, first=True, margin=0.38))
+    _success_bar(figure, _strips(figure.add_subplot(), result, margin=0.38))
     return figure
 
 
@@ -223,8 +219,8 @@ def map_figure(result: dict[str, Any]) -> Figure:
     axes.grid(False)
     success = np.array(result["map"]["success"]).T
     image = axes.pcolormesh(x, y, success, cmap=COLOURS, vmin=0, vmax=1, shading="nearest")
-    axes.set_xlabel(_label(x_name))
-    axes.set_ylabel(_label(y_name))
+    axes.set_xlabel(_label(VARIATIONS[x_name]))
+    axes.set_ylabel(_label(VARIATIONS[y_name]))
     axes.set_title(f"{result['robot']}: success over two imperfections")
     figure.colorbar(image, ax=axes, label="fraction of runs that end upright")
     return figure
@@ -232,21 +228,13 @@ def map_figure(result: dict[str, Any]) -> Figure:
 
 def _table(result: dict[str, Any]) -> str:
     """The grids as CSV, a row for every value."""
-    text = io.StringIO()
+    text, grids = io.StringIO(), _grids(result)
+    numbers = ["success"] + ["performance"] * any("performance" in grid for *_, grid in grids)
     writer = csv.writer(text, lineterminator="\n")
-    scored = any(
-        "performance" in g for c in result["criteria"].values() for g in c["grids"].values()
-    )
-    writer.writerow(
-        ["robot", "criterion", "imperfection", "unit", "value", "success"]
-        + ["performance"] * scored
-    )
-    for criterion, found in result["criteria"].items():
-        for name, grid in found["grids"].items():
-            columns = [grid["values"], grid["success"], *([grid["performance"]] if scored else [])]
-            for value, *numbers in zip(*columns, strict=True):
-                unit = VARIATIONS[grid.get("variation", name)].unit
-                writer.writerow([result["robot"], criterion, name, unit, value, *numbers])
+    writer.writerow(["robot", "criterion", "imperfection", "unit", "value", *numbers])
+    for criterion, name, variation, grid in grids:
+        for row in zip(grid["values"], *(grid[number] for number in numbers), strict=True):
+            writer.writerow([result["robot"], criterion, name, variation.unit, *row])
     return text.getvalue()
 
 

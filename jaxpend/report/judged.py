@@ -7,10 +7,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..boards import HEADINGS, Board
+from ..boards import HEADINGS, Board, Task
 from ..controllers.files import load_controller, read_header
 from ..plant import forward_kinematics
-from ..robustness import KEYS, benchmark
+from ..robustness import benchmark
 from ..runs.reader import RunRecord
 from ..score import nominal_run
 
@@ -19,8 +19,9 @@ __all__ = ["Judged", "criteria_costs", "judge"]
 
 @dataclasses.dataclass(frozen=True)
 class Judged:
-    """A policy on the task of a board, in float64, and in the robustness benchmark."""
+    """A policy on a task, in float64, and in the robustness benchmark."""
 
+    task: Task
     score: float
     criteria: dict[str, float]
     success: bool
@@ -42,6 +43,11 @@ class Judged:
         return self.report["overall"] if self.report else None
 
     @property
+    def reach(self) -> float:
+        """What the end effector reaches when it is stretched, m."""
+        return float(self.task.plant.length.sum())
+
+    @property
     def whole(self) -> float:
         """Length of the time axis that shows all of the run, whole seconds."""
         return max(1.0, float(round(self.t[-1])))
@@ -54,7 +60,7 @@ class Judged:
         return min(self.whole, max(3.0, float(round(2.5 * self.up))))
 
 
-def judge(run: RunRecord, board: Board, keys: int = KEYS) -> Judged | None:
+def judge(run: RunRecord, board: Board, robustness: bool = True) -> Judged | None:
     """The official run of a run's best policy so far, its score, and its robustness.
 
     The policies of several seeds share one compilation.
@@ -62,23 +68,23 @@ def judge(run: RunRecord, board: Board, keys: int = KEYS) -> Judged | None:
     Args:
         run: its policy is judged; the result is None where there is none yet.
         board: whose task it is judged on.
-        keys: of the robustness benchmark; 0 leaves it out.
+        robustness: run the benchmark too.
     """
     if run.policy is None:
         return None
-    task = board.task
+    task, report = board.task, None
     with jax.enable_x64(True):
         trajectory, c = nominal_run(load_controller(run.policy, robot=run.robot), task)
         score = float(task.score(c))
         points = jax.vmap(forward_kinematics, (None, 0))(task.plant, trajectory.x)
-    report = None
-    if keys:
+    if robustness:
         policy = load_controller(run.policy, robot=run.robot)
-        found = benchmark(policy, board, jax.random.key(0), keys=keys)
+        found = benchmark(policy, board, jax.random.key(0))
         report = {"robot": run.robot} | found.as_dict()
     x = np.asarray(trajectory.x)
     samples = np.isfinite(x).all(axis=1).cumprod().sum()  # the first one is the start
     return Judged(
+        task=task,
         score=score,
         criteria={name: float(value) for name, value in vars(c).items() if name != "success"},
         success=bool(c.success),
@@ -91,15 +97,14 @@ def judge(run: RunRecord, board: Board, keys: int = KEYS) -> Judged | None:
     )
 
 
-def criteria_costs(judged: Judged, board: Board) -> list[dict[str, Any]]:
-    """The criteria of a board's score, and what each costs of it; none for another score."""
-    norms = dict(getattr(board.task.scoring, "norms", ()))
+def criteria_costs(judged: Judged) -> list[tuple[str, str, float]]:
+    """Every criterion of the score: heading, value with unit, cost; none for another score."""
+    norms = dict(getattr(judged.task.scoring, "norms", ()))
     rows = []
     for name, norm in norms.items():
-        title, unit, form, _ = HEADINGS[name]
+        heading, unit, form, _ = HEADINGS[name]
         value = judged.criteria[name]
         share = math.tanh(math.pi * value / norm)
         share = share if math.isfinite(share) else 1.0
-        text = f"{value:{form}}"
-        rows.append({"title": title, "value": text, "unit": unit, "cost": share / len(norms)})
+        rows.append((heading, f"{value:{form}} {unit}", share / len(norms)))
     return rows

@@ -7,7 +7,6 @@ bootstraps from the true next state.
 
 import dataclasses
 from functools import cached_property, partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +18,13 @@ from ..controllers.policy import Policy
 from ..env import Env, EnvState
 from ..pytree import Pytree, pytree
 from . import losses, replay
-from .critics import Critic, TwinCritic
+from .critics import TwinCritic
 from .demonstrations import Imitation, imitate, imitation, swingups
 from .networks import Actor, Params, act, constant_log_std, to_policy
 from .replay import Replay, Transition
 
 __all__ = [
     "Agent",
-    "SACConfig",
     "SACState",
     "begin",
     "greedy_policy",
@@ -61,7 +59,7 @@ class Agent:
         return Actor(self.config.actor_hidden, self.config.activation)
 
     @cached_property
-    def critic(self) -> Critic:
+    def critic(self) -> TwinCritic:
         """What judges actions."""
         config = self.config
         return TwinCritic(config.critic_hidden, config.activation, config.critic_layer_norm)
@@ -70,11 +68,9 @@ class Agent:
     def optimizer(self) -> optax.GradientTransformation:
         """Adam with cosine decay over the whole run."""
         config = self.config
-        total = config.steps // config.num_envs * config.updates_per_step
-        schedule = optax.cosine_decay_schedule(
-            config.learning_rate, max(total, 1), alpha=config.final_learning_rate
-        )
-        return optax.adam(schedule)
+        total = max(config.steps // config.num_envs * config.updates_per_step, 1)
+        rate, last = config.learning_rate, config.final_learning_rate
+        return optax.adam(optax.cosine_decay_schedule(rate, total, alpha=last))
 
 
 @pytree
@@ -316,28 +312,15 @@ def train_chunks(
     What counts steps is the same in all runs and not batched: a batched condition would become a
     select that copies the replay buffers at every step.
     """
-    first: Any = 0  # the batched axis; None where nothing is batched
-    none: Any = None
-    axes = SACState(**dict.fromkeys(SACState.__dataclass_fields__, first)).replace(
-        replay=Replay(first, none, none), env_steps=none, updates=none
-    )
+    first = states[0]
 
-    def per_axis(batched, shared, *trees):
-        def part(axis, *parts):
-            return shared(*parts) if axis is None else jax.tree.map(batched, *parts)
+    def chunk(state):
+        shared = state.replay.replace(position=first.replay.position, filled=first.replay.filled)
+        state = state.replace(replay=shared, env_steps=first.env_steps, updates=first.updates)
+        return train_chunk(agent, state, vector_steps)
 
-        return jax.tree.map(part, axes, *trees, is_leaf=lambda axis: axis is None)
-
-    stacked = per_axis(lambda *leaves: jnp.stack(leaves), lambda first, *_: first, *states)
-    chunk = jax.vmap(partial(train_chunk, agent, vector_steps=vector_steps), (axes,), (axes, 0))
-    after, metrics = chunk(stacked)
-    return [
-        (
-            per_axis(lambda leaf, i=i: leaf[i], lambda shared: shared, after),
-            {name: value[i] for name, value in metrics.items()},
-        )
-        for i in range(len(states))
-    ]
+    after = jax.vmap(chunk)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], after) for i in range(len(states))]
 
 
 def greedy_policy(agent: Agent, state: SACState) -> Policy:

@@ -1,7 +1,7 @@
 """Critics: what judges the actions of an actor. Another critic is another class of this form."""
 
 import dataclasses
-from typing import Protocol, cast
+from typing import cast
 
 from jax import Array
 
@@ -9,32 +9,15 @@ from . import losses
 from .networks import Params, Twins
 from .replay import Transition
 
-__all__ = ["Critic", "TwinCritic"]
-
-
-class Critic(Protocol):
-    """A hashable value; ``params`` are what ``init`` returns, n is the size of a batch."""
-
-    def init(self, key: Array, obs: Array, privileged: Array, action: Array) -> Params:
-        """Parameters for what is seen and done, of these shapes; ``key`` is consumed."""
-
-    def value(self, params: Params, obs: Array, privileged: Array, action: Array) -> Array:
-        """What the actor climbs, (...,): the expected return of actions (...,)."""
-
-    def loss(
-        self, params: Params, target: Params, batch: Transition, next_action: Array,
-        next_cost: Array, discount: float,
-    ) -> tuple[Array, Array]:  # fmt: skip
-        """The loss () and the mean value () on a batch (n, ...).
-
-        ``target`` are slowly following parameters, ``next_action`` (n,) is drawn by the actor
-        in the next state, ``next_cost`` (n,) the temperature times its log-probability.
-        """
+__all__ = ["TwinCritic"]
 
 
 @dataclasses.dataclass(frozen=True)
 class TwinCritic:
-    """Two independent action values, of which the lower counts (Fujimoto et al., 2018)."""
+    """Two independent action values, of which the lower counts (Fujimoto et al., 2018).
+
+    A hashable value; ``params`` are what ``init`` returns, n is the size of a batch.
+    """
 
     hidden: tuple[int, ...]
     activation: str
@@ -45,18 +28,27 @@ class TwinCritic:
         """Of both values."""
         return Twins(self.hidden, self.activation, self.layer_norm)
 
+    def init(self, key: Array, obs: Array, privileged: Array, action: Array) -> Params:
+        """Parameters for what is seen and done, of these shapes; ``key`` is consumed."""
+        return self.network.init(key, obs, privileged, action)
+
     def both(self, params: Params, obs: Array, privileged: Array, action: Array) -> Array:
         """Both values (..., 2)."""
         return cast(Array, self.network.apply(params, obs, privileged, action))
 
-    def init(self, key, obs, privileged, action):
-        return self.network.init(key, obs, privileged, action)
-
-    def value(self, params, obs, privileged, action):
+    def value(self, params: Params, obs: Array, privileged: Array, action: Array) -> Array:
+        """What the actor climbs, (...,): the expected return of actions (...,)."""
         return self.both(params, obs, privileged, action).min(axis=-1)
 
-    def loss(self, params, target, batch, next_action, next_cost, discount):
-        """The squared distance of both values to the soft target."""
+    def loss(
+        self, params: Params, target: Params, batch: Transition, next_action: Array,
+        next_cost: Array, discount: float,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """The squared distance () of both values to the soft target, and the mean value ().
+
+        ``target`` are slowly following parameters, ``next_action`` (n,) is drawn by the actor
+        in the next state, ``next_cost`` (n,) the temperature times its log-probability.
+        """
         next_value = self.value(target, batch.next_obs, batch.next_privileged, next_action)
         goal = losses.soft_target(batch.reward, next_value, next_cost, discount)
         q = self.both(params, batch.obs, batch.privileged, batch.action)

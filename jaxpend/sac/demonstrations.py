@@ -112,11 +112,7 @@ def imitation(config: DemonstrationConfig, params: Params, key: jax.Array) -> Im
 
 @partial(jax.jit, static_argnames=("config", "actor", "updates"))
 def imitate(
-    config: DemonstrationConfig,
-    actor: Actor,
-    learner: Imitation,
-    shown: Replay,
-    updates: int,
+    config: DemonstrationConfig, actor: Actor, learner: Imitation, shown: Replay, updates: int
 ) -> tuple[Imitation, jax.Array]:
     """Fit the actor's greedy action to the wanted ones; returns the learner and losses (updates,).
 

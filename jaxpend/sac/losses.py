@@ -1,15 +1,13 @@
 """What SAC minimises (Haarnoja et al., 2018, arXiv 1812.05905); n is the size of a batch."""
 
 import chex
-import jax
 import jax.numpy as jnp
+from jax import Array
 
 __all__ = ["actor", "imitation", "soft_target", "squared_error", "temperature_slope"]
 
 
-def soft_target(
-    reward: jax.Array, next_value: jax.Array, next_cost: jax.Array, discount: float
-) -> jax.Array:
+def soft_target(reward: Array, next_value: Array, next_cost: Array, discount: float) -> Array:
     """What action values should be, (n,).
 
     ``next_value`` (n,) is of an action drawn in the next state, ``next_cost`` (n,) the temperature
@@ -20,7 +18,7 @@ def soft_target(
     return reward + discount * (next_value - next_cost)
 
 
-def squared_error(values: jax.Array, target: jax.Array) -> jax.Array:
+def squared_error(values: Array, target: Array) -> Array:
     """Mean squared distance of the values (n, critics) to their common target (n,)."""
     chex.assert_equal_shape_prefix((values, target), 1)
     chex.assert_rank((values, target), (2, 1))
@@ -28,23 +26,21 @@ def squared_error(values: jax.Array, target: jax.Array) -> jax.Array:
     return jnp.mean((values - target[:, None]) ** 2)
 
 
-def actor(value: jax.Array, cost: jax.Array) -> jax.Array:
+def actor(value: Array, cost: Array) -> Array:
     """The soft value, negated: ``value`` (n,) of drawn actions, ``cost`` (n,) as above."""
     chex.assert_equal_shape((value, cost))
     # -mean (Q(s, a) - T log pi(a|s))
     return -(value - cost).mean()
 
 
-def imitation(mean: jax.Array, wanted: jax.Array) -> jax.Array:
+def imitation(mean: Array, wanted: Array) -> Array:
     """Mean squared distance of greedy actions to the wanted ones (n,); ``mean`` is before tanh."""
     chex.assert_equal_shape((mean, wanted))
     # mean (tanh(mu(s)) - a*)^2
     return jnp.mean((jnp.tanh(mean) - wanted) ** 2)
 
 
-def temperature_slope(
-    log_temperature: jax.Array, entropy: jax.Array, target_entropy: float
-) -> jax.Array:
+def temperature_slope(log_temperature: Array, entropy: Array, target_entropy: float) -> Array:
     """The slope () of the temperature's loss in its logarithm: it holds the entropy at a target."""
     chex.assert_rank((log_temperature, entropy), 0)
     # d/d(log T) of T (H - H*)

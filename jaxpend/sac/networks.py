@@ -6,6 +6,7 @@ from typing import Any, cast
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax import Array
 
 from ..controllers.policy import ACTIVATIONS, Policy
 from ..env import Env
@@ -25,7 +26,7 @@ class Trunk(nn.Module):
     layer_norm: bool = False
 
     @nn.compact
-    def __call__(self, h: jax.Array) -> jax.Array:
+    def __call__(self, h: Array) -> Array:
         """Features (..., hidden[-1]) of inputs (..., n)."""
         for width in self.hidden:
             h = nn.Dense(width)(h)
@@ -46,7 +47,7 @@ class Actor(nn.Module):
     activation: str
 
     @nn.compact
-    def __call__(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def __call__(self, obs: Array) -> tuple[Array, Array]:
         """For observations (..., obs_size)."""
         h = Trunk(self.hidden, self.activation)(obs)
         mean = nn.Dense(1, name="mean")(h)
@@ -62,7 +63,7 @@ class Twins(nn.Module):
     layer_norm: bool
 
     @nn.compact
-    def __call__(self, obs: jax.Array, privileged: jax.Array, action: jax.Array) -> jax.Array:
+    def __call__(self, obs: Array, privileged: Array, action: Array) -> Array:
         """Action values (..., 2) of what is seen and actions (...,)."""
         inputs = jnp.concatenate([obs, privileged, action[..., None]], axis=-1)
         values = []
@@ -72,9 +73,7 @@ class Twins(nn.Module):
         return jnp.concatenate(values, axis=-1)
 
 
-def sample_action(
-    mean: jax.Array, log_std: jax.Array, key: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def sample_action(mean: Array, log_std: Array, key: Array) -> tuple[Array, Array]:
     """Sample tanh(N(mean, std)) for a mean and a logarithm of std (..., 1), as of ``Actor``.
 
     Returns the action (...,) and its log-probability (...,), computed from the sample before the
@@ -88,11 +87,9 @@ def sample_action(
     return jnp.tanh(v)[..., 0], log_prob[..., 0]
 
 
-def act(
-    actor: Actor, params: Params, obs: jax.Array, key: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def act(actor: Actor, params: Params, obs: Array, key: Array) -> tuple[Array, Array]:
     """``sample_action`` for observations (..., obs_size)."""
-    mean, log_std = cast(tuple[jax.Array, jax.Array], actor.apply(params, obs))
+    mean, log_std = cast(tuple[Array, Array], actor.apply(params, obs))
     return sample_action(mean, log_std, key)
 
 

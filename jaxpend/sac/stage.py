@@ -14,7 +14,7 @@ from ..stage import Candidates, Chart, Row, Stage
 from . import algorithm
 from .algorithm import Agent, SACState
 
-__all__ = ["SAC", "Imitation", "ImitationState"]
+__all__ = ["SAC", "Imitation", "ImitationState", "chunk_length"]
 
 
 @pytree
@@ -74,6 +74,15 @@ class Imitation(Stage[None, ImitationState, SACState]):
         return state.sac.replace(actor=state.learner.params)
 
 
+def chunk_length(total: int, most: int) -> int:
+    """The longest chunk of at most ``most`` steps that divides ``total``, for one compilation.
+
+    If that is less than half as long as it may be, ``most``: then the last chunk is shorter.
+    """
+    fitting = [length for length in range(most // 2 + 1, most + 1) if total % length == 0]
+    return fitting[-1] if fitting else most
+
+
 class SAC(Stage[SACState | None, SACState, Controller]):
     """SAC on the surrogate reward; judged by the official score."""
 
@@ -91,7 +100,9 @@ class SAC(Stage[SACState | None, SACState, Controller]):
 
     def __init__(self, config: SACConfig, task: Task):
         self.agent, self.task, self.total = Agent(config, task), task, config.steps
-        self.vector_steps = max(config.eval_every // config.num_envs, 1)
+        self.vector_steps = chunk_length(
+            -(-config.steps // config.num_envs), max(config.eval_every // config.num_envs, 1)
+        )
 
     @classmethod
     def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
