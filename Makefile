@@ -30,7 +30,7 @@ $(STAMP): pyproject.toml .constraints.txt
 
 install: $(STAMP)  ## make .venv with pinned versions
 
-train: $(STAMP)  ## SAC, then SNES, for ROBOT; ends with the official score
+train: $(STAMP)  ## imitation, SAC and SNES by the recipe of ROBOT; ends with the official score
 	$(BIN)/jaxpend train --config $(ROBOT) --seed $(SEED) --run $(RUN) $(ARGS)
 
 snes: $(STAMP)  ## fine-tune by SNES: ARGS='--policy FILE' or '--controller NAME'
@@ -42,7 +42,7 @@ score: $(STAMP)  ## official score of the shipped policy, or ARGS='--policy FILE
 robustness: $(STAMP)  ## six-criterion robustness of the shipped policy, or ARGS='--policy FILE'
 	$(BIN)/jaxpend robustness --robot $(ROBOT) --seed $(SEED) $(ARGS)
 
-leaderboard: $(STAMP)  ## every known controller on both boards, next to the published rows
+leaderboard: $(STAMP)  ## every known controller on the board of ROBOT, next to the published rows
 	$(BIN)/jaxpend leaderboard --robot $(ROBOT) $(ARGS)
 
 runs: $(STAMP)  ## list the runs with their state and scores

@@ -56,21 +56,26 @@ def draw(axis, found: list[tuple], labelled: str) -> None:
         mine = [p for p in found if p[0] == kind]
         axis.scatter(
             [p[2] for p in mine], [p[3] for p in mine], s=130 if marker == "*" else 36, c=colour,
-            marker=marker, label=title, zorder=3, edgecolors="white", linewidths=0.6,
+            marker=marker, label=title, zorder=3, alpha=0.85, edgecolors="white", linewidths=0.6,
         )  # fmt: skip
         named = sorted(mine, key=lambda p: -p[3]) if kind == labelled else []
         for i, (_, label, x, y) in enumerate(named):
-            # Left of a published point, right of the crowd; below, where a label stands above.
-            left = kind == "published"
+            # Right of a point; below or above it where other points or labels are in the way.
             crowded = any(abs(x - p[2]) < 0.1 and p[3] - y < 0.04 for p in named[:i])
+            place, side = (8, 2), "left"
+            if kind == "published" and (crowded or x > 0.45):
+                place, side = (0, -15 if crowded else 8), "center"
             axis.annotate(
-                label, (x, y), (-6 if left else 8, -9 if left and crowded else 2),
-                textcoords="offset points", fontsize=8, ha="right" if left else "left",
+                label, (x, y), place, textcoords="offset points", fontsize=8, ha=side,
                 color=colour, annotation_clip=True, zorder=2.5,
                 bbox={"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 0.5},
             )  # fmt: skip
     scores = np.array([p[2:] for p in found if p[0] != "published"])
-    axis.plot(*scores[front(scores)].T, color="0.6", lw=1.2, zorder=2)
+    label = "beaten in both by nothing that was measured"
+    # A staircase: below it and to its left, something that was measured is at least as good.
+    edge = np.concatenate([[[0, 0]], scores[front(scores)], [[0, 0]]])
+    edge[0], edge[-1] = (0, edge[1, 1]), (edge[-2, 0], 0)
+    axis.step(*edge.T, where="pre", color="0.6", lw=1.2, zorder=1, label=label)
     axis.grid(color="0.92")
     axis.set_axisbelow(True)
 

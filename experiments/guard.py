@@ -92,8 +92,8 @@ def main(runs: int = 1024, seed: int = 0, out: Path = Path(__file__).parent / "g
     """Judge every variant around TVLQR on the shipped swing-up, as it is demonstrated."""
     lines = [
         f"Fraction of {runs} random scenarios that end upright (seed {seed}), the main controller",
-        "being TVLQR. Standard error about 0.01 (all), 0.02 (a kind); the same scenarios in every",
-        "row.",
+        "being TVLQR as it is demonstrated (r=10, delay 0.044 s; the leaderboard has the plain",
+        "one). Standard error about 0.01 (all), 0.02 (a kind); the same scenarios in every row.",
     ]
     for robot in designs.ROBOTS:
         plant = designs.competition(robot)

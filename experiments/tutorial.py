@@ -21,6 +21,7 @@ from jaxpend import Scenario, load_policy, rollout, sac, save_policy, snes
 from jaxpend.boards import v2
 from jaxpend.config import SACConfig, SNESConfig
 from jaxpend.controllers import guard, load_reference, lqr
+from jaxpend.controllers.catalogue import build
 from jaxpend.controllers.search_space import FACTOR
 from jaxpend.plant import UPRIGHT, deviation, dynamics, forward_kinematics, total_energy
 from jaxpend.pytree import pytree
@@ -85,9 +86,9 @@ for name, controller in {"the policy that ships": load_policy("pendubot"), "mine
 guarded = guard(mine, "pendubot")
 grids = board.trials(plant)  # 15 rows of values; they can be others
 if SHORT:
-    grids = [replace(strip, values=strip.values[::5], repetitions=1) for strip in grids]
+    grids = [replace(strip, values=strip.values[::10], repetitions=1) for strip in grids]
 reports = {
-    name: benchmark(controller, board, jax.random.key(0), grids=grids)
+    name: benchmark(controller, board, jax.random.key(0), grids=grids, keys=1 if SHORT else 3)
     for name, controller in {"mine": mine, "guarded": guarded}.items()
 }
 print(f"{'robustness [%]':22s}" + "".join(f"{name:>10s}" for name in reports))
@@ -106,31 +107,40 @@ found = survey(plant, guarded, values, jax.random.key(1))
 print("1: it stands after 10 s. A row for each mass, a column for each delay")
 print(found.success.astype(int))
 
-# %% SNES: what a controller declares in SEARCHED is improved, here the gain
-# The fitness is the score, with ``scenarios`` its mean with the scores in random imperfect ones. A
-# budget as small as this one shows how, and no more.
-config = SNESConfig(
-    generations=2 if SHORT else 20, population=4 if SHORT else 16, scenarios=0 if SHORT else 8
-)
-search = snes.init(config, mine, jax.random.key(2))
-search, history = snes.evolve(config, mine, search, config.generations, task)
-print("mean fitness, from generation to generation:", np.round(history["mean_fitness"], 3))
-tuned = snes.best_controller(config, mine, search)
-print(f"the score was {result['score']:.4f} and is {official(tuned, board)['score']:.4f}")
+# %% SNES, an evolution strategy: what a controller declares in SEARCHED is improved
+# The gain of ``mine`` leaves nothing to gain, so take a controller whose numbers were chosen by
+# hand: energy shaping, with LQR at the top. A generation draws controllers around the mean of the
+# search, here 5 % away, and moves the mean towards the better ones. With ``scenarios=8`` the
+# fitness would hold the mean score in random imperfect scenarios too. The search does not know
+# the controller that it started from, so that controller stays if the best one found is no better.
+by_hand = build("energy_lqr", plant, "pendubot")
+config = SNESConfig(generations=20 if SHORT else 60, population=12 if SHORT else 40)
+search = snes.init(config, by_hand, jax.random.key(2))
+search, history = snes.evolve(config, by_hand, search, config.generations, task)
+print("best fitness so far:", np.round(np.maximum.accumulate(history["max_fitness"])[::5], 3))
+best = snes.best_controller(config, by_hand, search)
+before, after = (official(controller, board)["score"] for controller in (by_hand, best))
+tuned = best if after > before else by_hand
+print(f"energy shaping by hand: v2 score {before:.4f}; the best that SNES found: {after:.4f}")
 
 # %% SAC: a policy learns from the reward alone
-# All that stays the same is in the agent, all that changes in the state. A Python loop over chunks
-# gives progress; jaxpend train adds checkpoints, the best policy and a folder for the run.
+# This shows how it is called: its budget is far too small for a policy that swings up. All that
+# stays the same is in the agent, all that changes in the state. A Python loop over chunks gives
+# progress; jaxpend train adds checkpoints, the best policy and a folder for the run.
 width = (32, 32) if SHORT else (256, 256)
 agent = sac.Agent(
-    SACConfig(num_envs=16, actor_hidden=width, critic_hidden=width, warmup_steps=500), task
+    SACConfig(
+        num_envs=8 if SHORT else 16, actor_hidden=width, critic_hidden=width, warmup_steps=500
+    ),
+    task,
 )
 state = sac.init(agent, jax.random.key(3))
 for _ in range(2 if SHORT else 20):
     state, metrics = sac.train_chunk(agent, state, vector_steps=50)
     print(f"{int(state.env_steps):,} steps, mean reward {float(metrics['reward']):.3f}")
 learned = sac.greedy_policy(agent, state)
-print(f"score after so little: {official(learned, board)['score']:.4f}")
+score = official(learned, board)["score"]
+print(f"the score is {score:.4f}: so few steps teach it nothing yet; jaxpend train takes 400,000")
 save_policy(OUT / "learned.npz", learned)  # load_policy reads it, and every command takes it
 
 # %% Looking at it: charts draw on the axes they are given

@@ -147,13 +147,13 @@ class Board:
         return self.task.robot
 
 
-# The criteria of the performance score: heading, unit and format.
+# The criteria of the performance score: heading, unit, format, and a short heading for a terminal.
 HEADINGS = {
-    "swingup_time": ("swing-up", "s", ".2f"),
-    "energy": ("energy", "J", ".2f"),
-    "tau_cost": ("torque cost", "N²m²s", ".2f"),
-    "tau_smoothness": ("smoothness", "N m", ".4f"),
-    "velocity_cost": ("velocity cost", "rad²/s", ".1f"),
+    "swingup_time": ("swing-up", "s", ".2f", "swing-up"),
+    "energy": ("energy", "J", ".2f", "energy"),
+    "tau_cost": ("torque cost", "N²m²s", ".2f", "torque"),
+    "tau_smoothness": ("smoothness", "N m", ".4f", "smooth"),
+    "velocity_cost": ("velocity cost", "rad²/s", ".1f", "velocity"),
 }
 # Performance and robustness, as published (arXiv 2409.08938 and the boards).
 _PUBLISHED = {

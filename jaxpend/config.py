@@ -240,7 +240,8 @@ class Run(Checked):
     seeds: Annotated[int, Bounds(above=0, most=1000)] = 1
     # Several seeds in one computation; auto: on an accelerator.
     vmap: Literal["auto", "yes", "no"] = "auto"
-    run: str = ""  # name of the run folder; empty: ROBOT-seedSEED, or ROBOT-snes-seedSEED
+    # Name of the run folder; empty: ROBOT-seedSEED, of one stage alone ROBOT-STAGE-seedSEED.
+    run: str = ""
     runs: str = "runs"  # folder of the run folders
     checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
     # rollback: back to the last chunk, on with another key.

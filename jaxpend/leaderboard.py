@@ -1,4 +1,4 @@
-"""``jaxpend leaderboard``: every controller on both v2 boards, next to published rows.
+"""``jaxpend leaderboard``: every controller on the v2 board of a robot, next to the published rows.
 
 Performance is the official score and its criteria in float64; robustness is the six-criterion
 benchmark in float32, as ``jaxpend robustness`` runs it.
@@ -96,7 +96,7 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     return [
         row["title"] + (" (published)" if row["source"] == "published" else ""),
         shown(row["score"], ".3f"),
-        *(shown(criteria.get(name), form) for name, (_, _, form) in HEADINGS.items()),
+        *(shown(criteria.get(name), form) for name, (_, _, form, _) in HEADINGS.items()),
         *(shown(six.get(name), ".2f") for name in CRITERIA),
         shown(row["robustness"], ".3f"),
     ]
@@ -104,7 +104,7 @@ def cells(row: Mapping[str, Any]) -> list[str]:
 
 def markdown(board: Mapping[str, Any]) -> str:
     """The board as a Markdown table; of several keys, median and range of the robustness."""
-    criteria = [f"{heading} [{unit}]" for heading, unit, _ in HEADINGS.values()]
+    criteria = [f"{heading} [{unit}]" for heading, unit, *_ in HEADINGS.values()]
     headings = ["controller", "score", *criteria, *CRITERIA.values(), "robustness"]
     lines = [headings, ["---"] + ["---:"] * (len(headings) - 1)]
     for row in board["rows"]:

@@ -14,7 +14,9 @@ def test_the_tutorial_runs_and_says_what_it_promises(tmp_path):
     assert done.returncode == 0, done.stderr
     scores = re.findall(r"v2 score (0\.\d+)", done.stdout)
     assert all(0.4 < float(score) < 0.75 for score in scores)
-    assert len(scores) >= 2
+    assert len(scores) >= 3
+    before, after = re.search(r"by hand: v2 score (\S+); .* found: (\S+)", done.stdout).groups()
+    assert float(after) > float(before) + 0.02
     assert (tmp_path / "build" / "tutorial" / "swingup.png").stat().st_size > 10_000
 
 

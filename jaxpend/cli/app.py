@@ -31,7 +31,9 @@ class Command:
 
 COMMANDS = {
     "train": Command(
-        "train a policy", "SAC, then SNES, then the official score", "--config pendubot --seed 1"
+        "train a policy",
+        "imitation, SAC and SNES by a recipe; ends with the official score",
+        "--config pendubot --seed 1",
     ),
     "sac": Command("train a policy", "SAC on the surrogate reward", "--config pendubot --seed 1"),
     "gradient": Command(
@@ -56,7 +58,7 @@ COMMANDS = {
     ),
     "leaderboard": Command(
         "judge a controller",
-        "every known controller on both boards, next to the published rows",
+        "every known controller on the board of a robot, next to the published rows",
         "--robot acrobot --no-robustness",
     ),
     "runs": Command(

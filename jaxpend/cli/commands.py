@@ -19,7 +19,11 @@ if TYPE_CHECKING:
 
 
 def train(config: TrainRun, command: str) -> None:
-    """SAC on the surrogate reward, then the gradient and SNES on the score, in a run folder."""
+    """Imitation, SAC and SNES by a recipe; ends with the official score.
+
+    Imitation comes where the configuration has demonstrations, the gradient, between SAC and SNES,
+    where it has steps.
+    """
     execute(config, command)
 
 

@@ -127,7 +127,8 @@ class _Parser(argparse.ArgumentParser):
             self.add_argument(
                 "--config", metavar="FILE", action="append", default=argparse.SUPPRESS,
                 nargs=None if shows else "?", const=None if shows else "",
-                help=f"{file} ({', '.join(recipes())}); the other options override it",
+                help=f"{file} ({', '.join(recipes())}); the other options override it; without "
+                "one, the defaults, which are none of the recipes",
             )  # fmt: skip
             self.description += " -H shows what every option means." if shows == "short" else ""
         self.add_options(function, ())

@@ -2,7 +2,7 @@
 
 import datetime
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich import box
 from rich.table import Table
@@ -15,9 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["leaderboard_table", "robustness_table", "runs_table", "score_table", "seeds_table"]
 
-# Headings of ``leaderboard_table``, in the order of ``boards.HEADINGS`` and ``boards.CRITERIA``.
-SHORT = ("up s", "J", "torque²", "steps", "speed²")
-SHORT_ROBUSTNESS = ("model", "vel.", "torque", "resp.", "delay", "pulses")
+HEADINGS_OF_RUNS = ("run", "robot", "stages", "seed", "state", "score", "time", "date")
 COLOURS = {"finished": "green", "running": "cyan", "interrupted": "yellow", "broken": "red"}
 
 
@@ -36,13 +34,21 @@ def score_table(results: Mapping[str, Mapping], board: "Board") -> None:
     table = _table("", *results, title=f"{board.robot}, {board.name}: score (float64)")
     table.add_row("score", *(Text(f"{r['score']:.4f}", "bold") for r in results.values()))
     table.add_row("success", *("yes" if r.get("success") else "no" for r in results.values()))
-    for key, (heading, unit, form) in HEADINGS.items():
-        cells = (format(r["criteria"][key], form) for r in results.values())
+    for name, (heading, unit, form, _) in HEADINGS.items():
+        cells = (_criterion(result, name, form) for result in results.values())
         table.add_row(f"{heading} [{unit}]", *cells)
     console.print(table)
     if board.published:
         published = ", ".join(f"{title} {score:.3f}" for title, score, _ in board.published)
         console.print(f"published: {published}", style="dim")
+
+
+def _criterion(result: Mapping[str, Any], name: str, form: str) -> str:
+    """A criterion of a run; empty if an older run has none, "-" for when a failed one stood."""
+    if name == "swingup_time" and not result.get("success"):
+        return "-"
+    value = result["criteria"].get(name)
+    return "" if value is None else format(value, form)
 
 
 def robustness_table(result: Mapping[str, Any], board: "Board") -> None:
@@ -51,16 +57,21 @@ def robustness_table(result: Mapping[str, Any], board: "Board") -> None:
 
     title = f"{board.robot}, {board.name}: robustness, {result['simulations']} runs"
     title += f" of {board.task.duration:g} s"
-    table = _table("", "score [%]", "over keys [%]", "diverged", title=title)
+    table = _table("", "score [%]", "range over keys [%]", "diverged", title=title)
     over = result["over_keys"]
     several = len(over["overall"]) > 1
+
+    def spread(values: Sequence[float] | None) -> str:
+        if not several or not values:
+            return ""
+        return f"{100 * min(values):.1f} to {100 * max(values):.1f}"
+
     for name, found in result["criteria"].items():
-        drawn = over["scores"].get(name) if several else None
-        spread = f"{100 * min(drawn):.1f} to {100 * max(drawn):.1f}" if drawn else ""
+        drawn = spread(over["scores"].get(name))
         score = f"{100 * result['scores'][name]:.1f}"
-        table.add_row(CRITERIA.get(name, name), score, spread, str(found["diverged"]))
-    spread = f"{100 * over['mean']:.1f} ± {100 * over['std']:.1f}" if several else ""
-    table.add_row("Overall", Text(f"{100 * result['overall']:.1f}", "bold"), spread, "")
+        table.add_row(CRITERIA.get(name, name), score, drawn, str(found["diverged"]))
+    overall = Text(f"{100 * result['overall']:.1f}", "bold")
+    table.add_row("Overall", overall, spread(over["overall"]), "")
     console.print(table)
     seconds = f"{result['run_seconds']:.1f} s for {len(over['overall'])} key" + "s" * several
     median = "scores are medians over the keys; " if several else ""
@@ -76,48 +87,66 @@ def leaderboard_table(result: Mapping[str, Any], board: "Board") -> None:
 
     That of the robustness only if it was measured.
     """
-    from ..leaderboard import cells  # loads jax
+    from ..boards import CRITERIA, HEADINGS  # loads jax
+    from ..leaderboard import cells
 
-    parts = {"performance (float64)": ["score", *SHORT]}
+    # Words below one another, so that all columns fit.
+    short = [f"{name}\n[{unit}]" for _, unit, _, name in HEADINGS.values()]
+    six = [name.replace(" ", "\n").replace("Perturbations", "Pulses") for name in CRITERIA.values()]
+    parts = {"performance (float64)": (["score", *short], slice(0, 1 + len(short)))}
     if any(row["source"] == "measured" and row["robustness"] for row in result["rows"]):
-        parts["robustness"] = ["robust", *SHORT_ROBUSTNESS]
-    columns = ["score", *SHORT, *SHORT_ROBUSTNESS, "robust"]
-    for title, headings in parts.items():
-        caption = "* published" if board.published else None
-        title = f"{board.robot}, {board.name}: {title}"
-        table = _table("controller", *headings, title=title, caption=caption)
-        for column in table.columns:
-            column.no_wrap = True
+        parts["robustness"] = ([*six, "all six"], slice(1 + len(short), None))
+    for title, (headings, part) in parts.items():
+        table = Table(
+            title=f"{board.robot}, {board.name}: {title}", box=box.SIMPLE_HEAD, pad_edge=False,
+            show_edge=False, padding=(0, 1, 0, 0), caption="* published" * bool(board.published),
+        )  # fmt: skip
+        table.add_column("controller", overflow="fold")
+        for heading in headings:
+            table.add_column(heading, justify="right", no_wrap=True)
         for row in result["rows"]:
-            shown = dict(zip(columns, cells(row)[1:], strict=True))
-            style = "dim" if row["source"] == "published" else None
-            name = row["title"] + ("*" if row["source"] == "published" else "")
-            table.add_row(name, *(shown[heading] for heading in headings), style=style)
+            published = row["source"] == "published"
+            name = row["title"] + "*" * published
+            table.add_row(name, *cells(row)[1:][part], style="dim" if published else None)
         console.print(table)
 
 
 def runs_table(entries: Sequence[Mapping[str, Any]]) -> None:
     """Print what ``runs.reader.listing`` found, a row a run."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("run", "robot", "stages", "seed", "state", "score", "time", "changed"):
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=(0, 1, 0, 0))
+    rows = [_row(run) for run in entries]
+    columns = list(zip(HEADINGS_OF_RUNS, *rows, strict=True))
+    widths, room = [max(map(len, cells)) for cells in columns], console.width - 2 * len(columns) + 2
+    # Where there is no room, cells break between words; the name of a run, which is there to be
+    # copied, gets what is left.
+    for place in map(HEADINGS_OF_RUNS.index, ("date", "state", "stages")):
+        if sum(widths) > room:
+            widths[place] = max(map(len, " ".join(columns[place]).split()))
+    widths[0] = max(min(widths[0], room - sum(widths[1:])), 8)
+    for heading, width in zip(HEADINGS_OF_RUNS, widths, strict=True):
         right = heading in ("score", "time")
-        table.add_column(heading, justify="right" if right else "left", overflow="fold")
-    for run in entries:
-        seed = f"{len(run['seed'])} seeds" if "runs" in run else run["seed"]
-        at = f": {run['at']}" if run["at"] else ""
-        state = Text.assemble((run["state"], COLOURS[run["state"]]), at)
-        date = datetime.datetime.fromisoformat(run["changed"])
-        table.add_row(
-            run["run"], run["robot"] or "", ", ".join(s.upper() for s in run["stages"]),
-            "" if seed is None else str(seed),
-            state,
-            "" if run["score"] is None else f"{run['score']:.4f}",
-            "" if run["seconds"] is None else f"{run['seconds']:.0f} s",
-            f"{date:%d %b %H:%M}",
-        )  # fmt: skip
+        justify: Literal["left", "right"] = "right" if right else "left"
+        table.add_column(heading, justify=justify, overflow="fold", width=width)
+    for run, row in zip(entries, rows, strict=True):
+        table.add_row(*(Text(cell, COLOURS[run["state"]] * (i == 4)) for i, cell in enumerate(row)))
     console.print(table)
     if any("runs" in run for run in entries):
         console.print("the score of several seeds is the median of those finished", style="dim")
+
+
+def _row(run: Mapping[str, Any]) -> tuple[str, ...]:
+    """What is said of a run, in the order of ``HEADINGS_OF_RUNS``."""
+    seed = f"{len(run['seed'])} seeds" if "runs" in run else run["seed"]
+    return (
+        run["run"],
+        run["robot"] or "",
+        ", ".join(name.upper() for name in run["stages"]),
+        "" if seed is None else str(seed),
+        f"{run['state']}: {run['at']}" if run["at"] else run["state"],
+        "" if run["score"] is None else f"{run['score']:.4f}",
+        "" if run["seconds"] is None else f"{run['seconds']:.0f} s",
+        f"{datetime.datetime.fromisoformat(run['changed']):%d %b %H:%M}",
+    )
 
 
 def seeds_table(group: Mapping[str, Any]) -> None:

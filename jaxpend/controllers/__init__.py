@@ -1,4 +1,4 @@
-"""Controllers, one a file, all on the protocol of ``base.Controller``."""
+"""Controllers, one a file, all on the protocol of ``jaxpend.controller.Controller``."""
 
 from ..controller import Controller, Feedback, OpenLoop, Zero
 from ..trajopt.reference import Reference, load_reference, save_reference

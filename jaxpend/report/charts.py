@@ -140,8 +140,9 @@ def draw_phase(axes, x, joint: int) -> None:
     angle, velocity, goal = x[:, joint], x[:, 2 + joint], _goals(x)[joint]
     axes.plot(angle, velocity, color=PALETTE[("one", "two")[joint]], linewidth=1.4)
     mark = {"color": PALETTE["ink"], "marker": "o", "linestyle": "none", "markeredgewidth": 1.6}
-    axes.plot(angle[0], velocity[0], label="start", markersize=8, **mark)
-    axes.plot(goal, 0, label="goal", markersize=11, markerfacecolor="none", **mark)
+    axes.plot(angle[0], velocity[0], label="start", markersize=6, **mark)
+    # The ring lies around the dot where start and goal are the same angle, as of joint 2.
+    axes.plot(goal, 0, label="goal", markersize=14, markerfacecolor="none", **mark)
     _angle_axis(axes.xaxis, np.append(angle, goal))
     number = "₁₂"[joint]
     axes.set_xlabel(f"angle θ{number} [rad]")

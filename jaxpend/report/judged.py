@@ -102,7 +102,7 @@ def criteria_costs(judged: Judged) -> list[tuple[str, str, float]]:
     norms = dict(getattr(judged.task.scoring, "norms", ()))
     rows = []
     for name, norm in norms.items():
-        heading, unit, form = HEADINGS[name]
+        heading, unit, form, _ = HEADINGS[name]
         value = judged.criteria[name]
         share = math.tanh(math.pi * value / norm)
         share = share if math.isfinite(share) else 1.0

@@ -52,7 +52,7 @@ def _learning(runs: Sequence[RunRecord]) -> Iterator[tuple[str, Draw]]:
     # Seeds have the same stages; of an old run that has just begun, not all charts are known.
     for stage in max((run.stages for run in runs), key=lambda s: sum(len(x.charts) for x in s)):
         for title, columns, ylabel, log in stage.charts:
-            shown = list(columns.items())
+            shown, title = list(columns.items()), f"{stage.title}: {title}"
             if len(runs) > 1:
                 title += f", {shown[0][0]}" * (len(shown) > 1)
                 shown = shown[:1]
