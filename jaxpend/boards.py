@@ -19,7 +19,7 @@ from .errors import JaxpendError, choose
 from .plant import Plant
 from .robots import ROBOTS, active_joint
 from .rollout import Trajectory
-from .scenario import Scenario
+from .scenario import DT, Scenario
 from .variations import RANGES, sample
 
 __all__ = [
@@ -38,7 +38,7 @@ class Task:
     robot: str  # "acrobot" or "pendubot"
     parameters: tuple[tuple[str, float], ...]  # of the plant, named as in ``designs.from_dict``
     torque_limit: float = 6.0  # N m, of the driven joint
-    dt: float = 0.002  # s, control and integration period
+    dt: float = DT  # s, control and integration period
     duration: float = 10.0  # s
     height: float = HEIGHT  # the line, as a fraction of the stretched height
     scoring: Callable[[Criteria], jax.Array] = ScoreV2()  # hashable

@@ -18,12 +18,10 @@ from .config import LINES, EnvConfig, Reward
 from .plant import Plant, forward_kinematics, kinetic_energy, potential_energy, rk4_step
 from .pytree import Pytree, pytree
 from .rollout import actuate, draws, measure
-from .scenario import Scenario
+from .scenario import DT, Scenario
 from .variations import LONGEST_DELAY, sample
 
 __all__ = ["Env", "EnvConfig", "EnvState", "Reward", "World", "surrogate_reward"]
-
-SCENARIO_DT = 0.002  # s, the steps in which delays, noise and responses of scenarios are meant
 
 
 def surrogate_reward(plant: Plant, reward: Reward, line: float, x, action, before) -> jax.Array:
@@ -53,7 +51,7 @@ class World(Pytree):
     states: jax.Array  # (LONGEST_DELAY + 1, 4) true states, a ring buffer
     measured: jax.Array  # (4,)
     applied: jax.Array  # (2,) N m
-    k: jax.Array  # () int, steps of ``SCENARIO_DT``
+    k: jax.Array  # () int, steps of ``scenario.DT``
     key: jax.Array
 
 
@@ -148,7 +146,7 @@ class Env:
 
     def _through(self, world: World, x: jax.Array, torque: jax.Array) -> tuple[jax.Array, World]:
         """One control period in a scenario, by the parts of a step of ``rollout``."""
-        scenario, steps = world.scenario, max(round(self.config.dt / SCENARIO_DT), 1)
+        scenario, steps = world.scenario, max(round(self.config.dt / DT), 1)
         dt = self.config.dt / steps
         key, key_noise = jax.random.split(world.key)
 

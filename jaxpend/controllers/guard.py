@@ -27,6 +27,7 @@ from ..designs import competition
 from ..errors import JaxpendError
 from ..plant import UPRIGHT, Plant, deviation, rk4_step, total_energy
 from ..pytree import Pytree, pytree, static
+from ..scenario import DT
 from .energy import energy_shaping
 from .hybrid import with_lqr
 from .search_space import FACTOR
@@ -50,7 +51,7 @@ class Observer(Pytree):
 
     plant: Plant  # the model; its torque limit clips what was asked for
     gain: jax.Array  # (3,) l1, l2 (1/s), l3 (1/s^2)
-    dt: float = static(default=0.002)  # s, between calls
+    dt: float = static(default=DT)  # s, between calls
 
     def reset(self):
         """Memory before the first measurement."""
@@ -73,7 +74,7 @@ class Observer(Pytree):
         return (*memory[:3], jnp.clip(torque, -limit, limit).astype(memory[3].dtype))
 
 
-def observer(plant: Plant, bandwidth: float, *, dt: float = 0.002) -> Observer:
+def observer(plant: Plant, bandwidth: float, *, dt: float = DT) -> Observer:
     """The observer of a plant with all error poles at ``bandwidth`` (rad/s), called every ``dt`` s.
 
     Raises ``JaxpendError`` if bandwidth or dt is not positive.

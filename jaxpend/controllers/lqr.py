@@ -17,6 +17,7 @@ from ..designs import active_joint
 from ..errors import JaxpendError
 from ..plant import UPRIGHT, Plant, deviation, linearize
 from ..pytree import pytree
+from ..scenario import DT
 from .search_space import FACTOR
 
 __all__ = ["DEFAULT_Q", "DEFAULT_R", "LQR", "delay_tolerant", "in_float64", "lqr"]
@@ -76,7 +77,7 @@ def lqr(
     *,
     q: tuple[float, ...] = DEFAULT_Q,
     r: float = DEFAULT_R,
-    dt: float | None = 0.002,
+    dt: float | None = DT,
 ) -> LQR:
     """LQR at upright for the driven joint of ``robot``, solved in float64 on the host (scipy).
 
@@ -127,7 +128,7 @@ def _growth(a: np.ndarray, b: np.ndarray, gain: np.ndarray, steps: int) -> float
     return float(np.log(np.abs(np.linalg.eigvals(loop)).max()))
 
 
-def delay_tolerant(top: LQR, plant: Plant, delay: float, *, dt: float = 0.002) -> LQR:
+def delay_tolerant(top: LQR, plant: Plant, delay: float, *, dt: float = DT) -> LQR:
     """An LQR with a softer gain, that holds measurements delayed by anything up to ``delay`` (s).
 
     The gain is the static feedback whose slowest mode decays fastest in the worst of three loops:

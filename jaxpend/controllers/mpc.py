@@ -22,6 +22,7 @@ from ..designs import active_joint
 from ..errors import JaxpendError
 from ..plant import Plant, deviation
 from ..pytree import Pytree, pytree, static
+from ..scenario import DT
 from ..trajopt.ilqr import Problem, Solution, iterate, solve, warm_start
 from ..trajopt.reference import Reference
 from ..trajopt.swingup import step
@@ -67,7 +68,7 @@ class MPC(Pytree):
     first: Solution  # plan at t = 0
     joint: int = static()
     horizon: int = static(default=100)  # H
-    dt: float = static(default=0.002)  # s, step of the prediction
+    dt: float = static(default=DT)  # s, step of the prediction
     every: int = static(default=5)  # steps between two optimisations
     iterations: int = static(default=2)
 

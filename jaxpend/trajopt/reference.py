@@ -11,6 +11,7 @@ from ..arrays import read_arrays, write_arrays
 from ..errors import JaxpendError, choose
 from ..pytree import Pytree, pytree, static
 from ..robots import ROBOTS, active_joint, shipped
+from ..scenario import DT
 
 __all__ = ["Reference", "load_reference", "save_reference"]
 
@@ -25,7 +26,7 @@ class Reference(Pytree):
     u: jax.Array  # (N,) N m, torque of the driven joint over step k
     gain: jax.Array  # (N, 5) of (state, last torque): u + gain . (deviation, last - u_{k-1})
     robot: str = static(default="pendubot")
-    dt: float = static(default=0.002)  # s
+    dt: float = static(default=DT)  # s
 
     @property
     def steps(self) -> int:
