@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxpend import Scenario, designs, sac, snes
 from jaxpend.boards import v2
-from jaxpend.config import TrainRun
+from jaxpend.config import Objective, TrainRun
 from jaxpend.config_files import load_config
 from jaxpend.controllers import Policy
 from jaxpend.controllers.catalogue import build
@@ -135,7 +135,8 @@ def bench_sac() -> None:
 def bench_snes() -> None:
     """A generation without and with imperfect scenarios."""
     for scenarios in (0, 16):
-        config = snes.SNESConfig(action_noise=0.0, scenarios=scenarios)
+        objective = Objective(0.5 if scenarios else 0.0)
+        config = snes.SNESConfig(action_noise=0.0, scenarios=scenarios, objective=objective)
         policy = random_policy(64)
         start = snes.init(config, policy, jax.random.key(0))
         compile_time, run, processor = timed(snes.evolve, config, policy, start, 2)

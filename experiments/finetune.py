@@ -12,7 +12,7 @@ from pathlib import Path
 
 from jaxpend import designs, leaderboard
 from jaxpend.boards import v2
-from jaxpend.config import SNESConfig, SNESRun
+from jaxpend.config import Objective, SNESConfig, SNESRun
 from jaxpend.controllers import load_controller
 from jaxpend.controllers.catalogue import CATALOGUE, build
 from jaxpend.files import write_atomically
@@ -27,12 +27,19 @@ CASES = {
     "switch16": (
         "policy_lqr",
         SNESConfig(
-            generations=30, population=20, searched="top,region", action_noise=0.0, scenarios=16
+            generations=30,
+            population=20,
+            searched="top,region",
+            action_noise=0.0,
+            scenarios=16,
+            objective=Objective(0.5),
         ),
     ),
     "tvlqr16": (
         "tvlqr",
-        SNESConfig(generations=60, population=20, gain_sigma=0.02, scenarios=16),
+        SNESConfig(
+            generations=60, population=20, gain_sigma=0.02, scenarios=16, objective=Objective(0.5)
+        ),
     ),
 }
 

@@ -33,7 +33,7 @@ import numpy as np
 from jaxpend import designs, leaderboard, load_policy
 from jaxpend.boards import v2
 from jaxpend.cli import emit_json
-from jaxpend.config import STRATEGIES, GradientConfig, SACRun, SNESConfig
+from jaxpend.config import STRATEGIES, GradientConfig, Objective, SACRun, SNESConfig
 from jaxpend.config_files import load_config
 from jaxpend.controllers import guard
 from jaxpend.files import write_atomically
@@ -62,9 +62,9 @@ SIZES = {
 }
 ROBUST = {  # methods of part 3, and their options
     "before": None,
-    "snes, 16 scenarios": {"scenarios": 16, "population": 20},
+    "snes, 16 scenarios": {"scenarios": 16, "objective": Objective(0.5), "population": 20},
     "snes": {},
-    "gradient, 32 scenarios": {"scenarios": 32},
+    "gradient, 32 scenarios": {"scenarios": 32, "objective": Objective(0.8)},
 }
 ROBUST_RATE = 1e-4  # of the gradient; at what is best for the score nothing better was found
 ROBUST_STEPS = {"guarded": 60, "network": 150}

@@ -36,7 +36,9 @@ RECIPES = {
     "memory": ["--sac.env.observation.history", "4"],
     "randomised": ["--sac.env.randomised", "0.8"],
     "randomised memory": ["--sac.env.randomised", "0.8", "--sac.env.observation.history", "4"],
-    "robust SNES": ["--snes.scenarios", "16", "--snes.generations", "60"],
+    "robust SNES": [
+        "--snes.scenarios", "16", "--snes.objective.weight", "0.5", "--snes.generations", "60",
+    ],
     "plain": [],
 }  # fmt: skip
 # What is taken from the policy that the shipped recipe ended with; nothing is trained again.

@@ -32,6 +32,7 @@ __all__ = [
     "GradientConfig",
     "GradientRun",
     "GuardConfig",
+    "Objective",
     "Reward",
     "Run",
     "SACConfig",
@@ -76,6 +77,18 @@ class Reward(Checked):
 
 
 @dataclasses.dataclass(frozen=True)
+class Objective(Checked):
+    """How much it counts, beside the score, what becomes of random imperfect scenarios.
+
+    They are drawn by ``Task.sample``, never from the benchmark's grids or keys.
+    """
+
+    weight: Share = 0.0  # of the scenarios; 0: the score alone
+    outcome: Literal["score", "success"] = "score"  # of which the mean over scenarios is taken
+    validation: Count = 256  # scenarios, always the same, on which candidates are compared
+
+
+@dataclasses.dataclass(frozen=True)
 class EnvConfig(Checked):
     """The learning environment."""
 
@@ -88,12 +101,18 @@ class EnvConfig(Checked):
     upright_starts: Share = 0.0  # share of episodes that start near upright, not hanging
     # rad, standard deviation of both angles there; 3/s of velocities.
     upright_spread: Positive = 0.03
+    # Share of episodes that start anywhere: uniform angles, velocities with a standard deviation
+    # of 5 rad/s.
+    random_starts: Share = 0.0
     randomised: Share = 0.0  # share of episodes in a random scenario, see ``variations``
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.dt > self.duration:
             raise JaxpendError(f"dt is {self.dt}; it must not be longer than an episode")
+        if self.upright_starts + self.random_starts > 1:
+            text = f"{self.upright_starts} and {self.random_starts}; they are shares of one whole"
+            raise JaxpendError(f"upright_starts and random_starts are {text}")
 
     @property
     def episode_steps(self) -> int:
@@ -127,7 +146,9 @@ class SACConfig(Checked):
     """Hyperparameters of SAC."""
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
-    steps: Count = 600_000  # environment steps, all environments together
+    steps: Count = 600_000  # environment steps, all environments together, of an attempt
+    # Trainings from scratch; the gradient compares their best policies and goes on with one.
+    attempts: Annotated[int, Bounds(least=1, most=100)] = 1
     num_envs: Count = 32
     updates_per_step: Count = 4  # gradient updates per vector step (num_envs environment steps)
     batch_size: Count = 256
@@ -135,6 +156,7 @@ class SACConfig(Checked):
     mirror: bool = False  # half of every batch, by chance: there is no difference left to right
     warmup_steps: Natural = 5_000  # environment steps with uniform actions before learning
     discount: Annotated[float, Bounds(above=0, below=1)] = 0.99
+    n_step: Annotated[int, Bounds(least=1, most=100)] = 1  # rewards before a target bootstraps
     # Polyak averaging of the target critics.
     target_rate: Annotated[float, Bounds(above=0, most=1)] = 0.005
     learning_rate: Positive = 1e-3
@@ -150,12 +172,16 @@ class SACConfig(Checked):
     imitation: NotNegative = 0.0  # weight of the squared distance to the demonstrated actions
     actor_delay: Natural = 0  # environment steps before the actor learns; the critics start at once
     eval_every: Count = 25_000  # environment steps between judgements by the official score
+    objective: Objective = dataclasses.field(default_factory=Objective)  # of which policy is best
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.replay_capacity < self.num_envs:
-            text = f"it must hold at least one step of all {self.num_envs} environments"
+        if self.replay_capacity < self.num_envs * self.n_step:
+            text = f"it must hold n_step = {self.n_step} steps of all {self.num_envs} environments"
             raise JaxpendError(f"replay_capacity is {self.replay_capacity}; {text}")
+        for name in ("n_step", "attempts"):
+            if (number := getattr(self, name)) > 1 and self.demonstrations.episodes:
+                raise JaxpendError(f"{name} is {number}; with demonstrations it must be 1")
         shown = self.demonstrations
         if shown.episodes and self.batch_size < 2:
             raise JaxpendError("batch_size is 1; it must be at least 2, half are demonstrations")
@@ -168,11 +194,21 @@ class SACConfig(Checked):
 class GuardConfig(Checked):
     """What a policy is guarded with before SNES; see ``controllers.guard``. Nothing by default."""
 
-    bandwidth: NotNegative = 0.0  # rad/s, of the observer of the state from angles; 0: none
+    observe: bool = False  # a Kalman filter, so that the policy does not see what is measured
+    angle_noise: Positive = 1e-4  # rad, the least that the filter takes for the noise of angles
+    # rad/s, the same of velocities; they may be late, so that they are not believed more.
+    velocity_noise: Positive = 0.2
     rescue: bool = False  # energy shaping and LQR take over a swing-up that failed
     after: Positive = 2.0  # s, the time that a swing-up may take
     radius: Positive = 0.3  # rad, of either angle around upright; beyond it a swing-up has failed
     excess: Positive = 1.2  # J more than at upright, with which it has failed at any time
+
+
+def _met(scenarios: int, objective: Objective) -> None:
+    """Refuse scenarios that count nothing."""
+    if scenarios and not objective.weight:
+        text = "with objective.weight 0 they count nothing; give a weight, or no scenarios"
+        raise JaxpendError(f"scenarios is {scenarios}; {text}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,14 +225,14 @@ class SNESConfig(Checked):
     rollouts: Count = 1  # noisy rollouts per individual
     action_noise: NotNegative = 0.1  # of policies, standard deviation before the tanh; 0 for none
     scenarios: Natural = 0  # random imperfect scenarios a generation, the same for all individuals
-    scenario_weight: Share = 0.5  # of their mean score in the fitness, where there are any
-    validation: Count = 256  # scenarios, always the same, on which candidates are compared
+    objective: Objective = dataclasses.field(default_factory=Objective)
     chunk: Count = 10  # generations per report
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.strategy == "open_es" and self.population % 2:
             raise JaxpendError(f"population is {self.population}; open_es needs pairs")
+        _met(self.scenarios, self.objective)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -222,10 +258,16 @@ class GradientConfig(Checked):
     power_width: Positive = 0.01  # W, over which the kink of |power| is rounded
     scenarios: Natural = 0  # random imperfect scenarios a step
     scenario_duration: Duration = 4.0  # s
-    scenario_weight: Share = 0.8  # of them in what is climbed, where there are any
-    validation: Count = 256  # scenarios, always the same, on which steps are compared
+    objective: Objective = dataclasses.field(default_factory=Objective)
     memory: PositiveOrInfinite = 1.0  # s, with which their gradient fades back; inf: it does not
+    # Weight of the squared distance to the start's own actions in scenarios in which it stands.
+    retention: NotNegative = 0.0
+    retained_after: NotNegative = 2.0  # s, into a run; the swing-up before is free to change
     chunk: Count = 20  # steps per report
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _met(self.scenarios, self.objective)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,6 +23,8 @@ from .variations import LONGEST_DELAY, sample
 
 __all__ = ["Env", "EnvConfig", "EnvState", "Reward", "World", "surrogate_reward"]
 
+START_SPEED = 5.0  # rad/s, standard deviation of velocities of an episode that starts anywhere
+
 
 def surrogate_reward(plant: Plant, reward: Reward, line: float, x, action, before) -> jax.Array:
     """Reward of arriving in state ``x`` (4,) by ``action`` (), after the action ``before`` ().
@@ -99,7 +101,9 @@ class Env:
         return EnvState(x, action, past, world, obs, privileged, reward)
 
     def reset(self, key: jax.Array) -> EnvState:
-        """A new episode, hanging at rest or near upright; ``key`` draws which, and the scenario.
+        """A new episode, hanging at rest, near upright or anywhere.
+
+        ``key`` draws which, and the scenario.
 
         ``key`` is consumed; it may be a typed one or of the old style.
         """
@@ -116,13 +120,24 @@ class Env:
         return self.observe(x, zero, past, world, zero)
 
     def _start(self, key: jax.Array) -> jax.Array:
-        share, spread = self.config.upright_starts, self.config.upright_spread
-        if not share:
-            return jnp.zeros(4)
+        config, x = self.config, jnp.zeros(4)
         # Apart from the keys of the scenario.
-        key_where, key_x = jax.random.split(jax.random.fold_in(key, 1))
-        off = spread * jnp.array([1.0, 1.0, 3.0, 3.0]) * jax.random.normal(key_x, (4,))
-        return jnp.where(jax.random.bernoulli(key_where, share), off.at[0].add(jnp.pi), 0.0)
+        if share := config.upright_starts:
+            key_where, key_x = jax.random.split(jax.random.fold_in(key, 1))
+            spread = config.upright_spread * jnp.array([1.0, 1.0, 3.0, 3.0])
+            near = (spread * jax.random.normal(key_x, (4,))).at[0].add(jnp.pi)
+            x = jnp.where(jax.random.bernoulli(key_where, share), near, x)
+        if share := config.random_starts:
+            # Among the episodes that do not start near upright, so that both shares are right.
+            share = (
+                min(share / (1 - config.upright_starts), 1.0) if config.upright_starts < 1 else 0
+            )
+            key_where, key_angles, key_speeds = jax.random.split(jax.random.fold_in(key, 2), 3)
+            angles = jax.random.uniform(key_angles, (2,), minval=-jnp.pi, maxval=jnp.pi)
+            speeds = START_SPEED * jax.random.normal(key_speeds, (2,))
+            anywhere = jax.random.bernoulli(key_where, share) & ~jnp.any(x)
+            x = jnp.where(anywhere, jnp.concatenate([angles, speeds]), x)
+        return x
 
     def step(self, state: EnvState, action: jax.Array) -> EnvState:
         """One control period; ``action`` () is clipped to [-1, 1] and held."""

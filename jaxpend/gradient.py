@@ -6,10 +6,14 @@ trained policy, or from any other controller that declares what may be searched
 (``controllers/search_space.py``),
 
     (1 - w) smooth v2 score of the nominal run + w mean upright time of random scenarios
+        - r mean squared change of the action
 
 The first is that of ``swingup.py``. The second is there only with ``config.scenarios``: the mean
 over a run and over imperfect scenarios (``variations.sample``, new ones every step) of
-``1 / (1 + d^2)``, d the distance to upright in units of what the benchmark calls a success.
+``1 / (1 + d^2)``, d the distance to upright in units of what the benchmark calls a success; w is
+``config.objective.weight``. The third, with ``config.retention``, keeps what the policy does in
+scenarios in which it stands already (``retained``), as a policy is kept near its old self where
+it is not to forget (Li and Hoiem, "Learning without forgetting", 2016).
 
 Where motion is chaotic the gradient explodes and says nothing. Therefore the window is
 ``duration`` long, the norm of each run's gradient is clipped before they are averaged, a run
@@ -19,7 +23,7 @@ later states fades from the gradient, with the time constant ``memory``.
 
 import math
 from functools import partial
-from typing import Any, Self
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,19 +31,39 @@ import numpy as np
 import optax
 
 from .boards import Task, own_task
-from .config import GradientConfig, Run
+from .config import GradientConfig, Run, TrainRun
 from .controller import Controller, check_controller
+from .controllers.policy import Policy
 from .controllers.search_space import coordinates
-from .criteria import EPSILON
+from .criteria import EPSILON, upright
+from .errors import JaxpendError
 from .plant import rk4_step
 from .pytree import Pytree, pytree
 from .rollout import rollout
 from .scenario import Scenario
-from .stage import Candidates, Chart, Row, SearchStage, SearchState
+from .stage import Candidates, Chart, Row, SearchStage, SearchState, Stage
 from .trajopt.swingup import SwingUp, smooth_score, totals
 from .variations import LONGEST_DELAY
 
-__all__ = ["Gradient", "GradientConfig", "GradientState", "current", "improve", "init", "slope"]
+__all__ = [
+    "Gradient", "GradientConfig", "GradientState", "Retained", "current", "improve", "init",
+    "retained", "slope",
+]  # fmt: skip
+
+SHOWN = 128  # scenarios in which the start is watched, for what is retained
+EVERY = 0.04  # s, between the times that are kept
+DRAWN = 1024  # of them that a step looks at
+# Of those scenarios: no seed of a run, of a validation or of the benchmark.
+SHOWN_SEED = 2**31 - 3
+
+
+@pytree
+class Retained(Pytree):
+    """What a policy did in random scenarios, at n times."""
+
+    obs: jax.Array  # (n, obs_size) what it saw
+    action: jax.Array  # (n,) in [-1, 1]
+    counts: jax.Array  # (n,) 1 where it ended upright, else 0
 
 
 @pytree
@@ -50,6 +74,7 @@ class GradientState(Pytree):
     optimizer: Any  # optax state
     key: jax.Array
     lost: jax.Array  # () int, runs whose gradient was not finite, so far
+    retained: Retained | None = None  # with ``config.retention``
 
 
 def _fading(memory: float):
@@ -88,6 +113,37 @@ def robustness(
     return uprightness(run.x).mean()
 
 
+def retained(config: GradientConfig, policy: Policy, task: Task) -> Retained:
+    """What a policy does in scenarios of a task after ``config.retained_after`` s."""
+    key_scenarios, key_runs = jax.random.split(jax.random.key(SHOWN_SEED))
+    scenarios = jax.vmap(task.sample)(jax.random.split(key_scenarios, SHOWN))
+    first = round(config.retained_after / task.dt)
+    times = np.arange(first, round(task.duration / task.dt), max(round(EVERY / task.dt), 1))
+
+    def one(scenario, key):
+        options: dict[str, Any] = {"dt": task.dt, "duration": task.duration}
+        run = rollout(scenario, policy, key, delay_slots=LONGEST_DELAY + 1, **options)
+
+        def step(carry, now):
+            obs = policy.look(carry, *now)
+            return policy(carry, *now)[0], obs
+
+        seen = jax.lax.scan(step, policy.reset(key), (run.t[:-1], run.x_measured))[1][times]
+        return seen, jnp.broadcast_to(upright(run.x[-1]), times.shape)
+
+    obs, counts = jax.vmap(one)(scenarios, jax.random.split(key_runs, SHOWN))
+    obs = obs.reshape(-1, obs.shape[-1])
+    return Retained(obs, jnp.tanh(jax.vmap(policy.pre_action)(obs)), counts.ravel().astype("f4"))
+
+
+def change(policy: Policy, kept: Retained, key: jax.Array) -> jax.Array:
+    """Mean squared distance () of a policy's actions to some of those that are retained."""
+    some = jax.random.randint(key, (DRAWN,), 0, len(kept.action))
+    kept = jax.tree.map(lambda leaf: leaf[some], kept)
+    off = jnp.tanh(jax.vmap(policy.pre_action)(kept.obs)) - kept.action
+    return jnp.sum(kept.counts * off**2) / jnp.maximum(kept.counts.sum(), 1)
+
+
 def _usable(config: GradientConfig, value, slope):
     """Value and clipped gradient of a run, zero if they are not finite, and whether they are."""
     norm = jnp.linalg.norm(slope)
@@ -112,7 +168,7 @@ def slope(config: GradientConfig, start: Controller, task: Task, z: jax.Array, k
     each = jax.value_and_grad(lambda z, s, k: robustness(config, rebuild(z), s, k, task))
     found = jax.vmap(each, in_axes=(None, 0, 0))(z, scenarios, keys[config.scenarios :])
     values, ascents, finite = jax.vmap(partial(_usable, config))(*found)
-    weight, kept = config.scenario_weight, jnp.maximum(finite.sum(), 1)
+    weight, kept = config.objective.weight, jnp.maximum(finite.sum(), 1)
     ascent = (1 - weight) * ascent + weight * ascents.sum(axis=0) / kept
     lost = lost + jnp.sum(~finite, dtype=jnp.int32)
     return ascent, lost, metrics | {"uprightness": values.sum() / kept}
@@ -132,11 +188,32 @@ def _adam(config: GradientConfig, weights: np.ndarray) -> optax.GradientTransfor
     return optax.chain(optax.scale_by_adam(), optax.scale_by_schedule(decay), sizes)
 
 
-def init(config: GradientConfig, controller: Controller, key: jax.Array) -> GradientState:
-    """The state at the controller, before the first step. Raises as ``search_space.kinds``."""
+def init(
+    config: GradientConfig, controller: Controller, key: jax.Array, task: Task | None = None
+) -> GradientState:
+    """The state at the controller, before the first step.
+
+    ``task`` may be left out for a controller that knows its robot (``boards.own_task``).
+
+    Raises:
+        JaxpendError: as ``search_space.kinds``, or retention of what is not a policy alone.
+    """
     check_controller(controller)
     z, weights, _ = coordinates(controller, config.searched)
-    return GradientState(z, _adam(config, weights).init(z), key, jnp.zeros((), jnp.int32))
+    state = GradientState(z, _adam(config, weights).init(z), key, jnp.zeros((), jnp.int32))
+    if not config.retention:
+        return state
+    _check_retention(controller)
+    return state.replace(retained=_watched(config, controller, own_task(controller, task)))
+
+
+_watched = jax.jit(retained, static_argnames=("config", "task"))
+
+
+def _check_retention(controller: Controller) -> None:
+    if not isinstance(controller, Policy):
+        text = "it needs a policy without a guard, and not"
+        raise JaxpendError(f"retention keeps actions of a network; {text} {controller!r:.40}")
 
 
 @partial(jax.jit, static_argnames=("config", "steps", "task"))
@@ -153,13 +230,21 @@ def improve(
     ``task`` may be left out for a controller that knows its robot (``boards.own_task``).
     """
     task = own_task(start, task)
-    optimizer = _adam(config, coordinates(start, config.searched)[1])
+    _, weights, rebuild = coordinates(start, config.searched)
+    optimizer = _adam(config, weights)
 
     def step(state, _):
         key, key_now = jax.random.split(state.key)
-        ascent, lost, metrics = slope(config, start, task, state.parameters, key_now)
-        change, memory = optimizer.update(ascent, state.optimizer)
-        state = GradientState(state.parameters + change, memory, key, state.lost + lost)
+        z = state.parameters
+        ascent, lost, metrics = slope(config, start, task, z, key_now)
+        if (kept := state.retained) is not None:
+            found = jax.value_and_grad(
+                lambda z: change(rebuild(z), kept, jax.random.fold_in(key_now, 1))
+            )(z)
+            ascent, metrics = ascent - config.retention * found[1], metrics | {"change": found[0]}
+        step, memory = optimizer.update(ascent, state.optimizer)
+        lost = state.lost + lost
+        state = state.replace(parameters=z + step, optimizer=memory, key=key, lost=lost)
         return state, metrics | {"slope": jnp.linalg.norm(ascent)}
 
     return jax.lax.scan(step, state, length=steps)
@@ -173,6 +258,12 @@ def current(config: GradientConfig, start: Controller, state: GradientState) -> 
 class Gradient(SearchStage):
     """The stage of training: the ascent; what is judged, by ``stage.value``, is where it is."""
 
+    def __init__(self, config: GradientConfig, policy: Any, task: Task):
+        """Raises ``JaxpendError`` as ``init``."""
+        super().__init__(config, policy, task)
+        if config.retention:
+            _check_retention(policy)
+
     name, title, unit, column = "gradient", "Gradient", "steps", "step"
     heading, scores = "after the gradient", ("score",)
     charts = (
@@ -182,13 +273,18 @@ class Gradient(SearchStage):
     )
 
     @classmethod
-    def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
+    def of(cls, run: Run, start: Controller | None, task: Task) -> Stage | None:
         config = getattr(run, "gradient", None)
-        return cls(config, start, task) if config and config.steps else None
+        if not (config and config.steps):
+            return None
+        if isinstance(run, TrainRun) and run.sac.attempts > 1:
+            return Contest(config, start, task, run.sac.attempts)
+        return cls(config, start, task)
 
     def begin(self, seed: int, controller: Controller) -> SearchState:
         key = jax.random.fold_in(jax.random.key(seed), 2)
-        return SearchState(controller, init(self.config, controller, key), jnp.asarray(0))
+        search = init(self.config, controller, key, self.task)
+        return SearchState(controller, search, jnp.asarray(0))
 
     def search(self, states: list[SearchState], count: int) -> list[tuple[GradientState, Row]]:
         return [improve(self.config, s.start, s.search, count, self.task) for s in states]
@@ -204,6 +300,84 @@ class Gradient(SearchStage):
 
     def watched(self, state: SearchState) -> jax.Array:
         return state.search.parameters
+
+
+@pytree
+class ContestState(Pytree):
+    """The ascents of several controllers, and which of them go on."""
+
+    each: tuple[SearchState, ...]
+    worths: jax.Array  # (contestants,) what they are compared by; -inf: out
+
+
+class Contest(Stage[tuple[Controller, ...], ContestState, Controller]):
+    """The gradient from several controllers, of which half is left out again and again.
+
+    Successive halving (Jamieson and Talwalkar, 2016): as an ascent stays in the basin in which
+    it begins, a short one from each of several controllers says which basin is worth the rest.
+    The last halving is in the middle of the stage.
+    """
+
+    name, title, unit, column = Gradient.name, Gradient.title, Gradient.unit, Gradient.column
+    heading, scores, charts = Gradient.heading, Gradient.scores, Gradient.charts
+
+    def __init__(self, config: GradientConfig, policy: Any, task: Task, contestants: int):
+        self.inner, self.contestants = Gradient(config, policy, task), contestants
+        self.config, self.policy, self.total = config, policy, config.steps
+
+    def start(self, seed: int, before: tuple[Controller, ...]) -> ContestState:
+        each = tuple(self.inner.start(seed, controller) for controller in before)
+        return ContestState(each, jnp.zeros(len(each)))
+
+    def like(self) -> ContestState:
+        return jax.eval_shape(partial(self.start, 0), (self.policy,) * self.contestants)
+
+    def policy_like(self) -> Controller:
+        return self.policy
+
+    def done(self, state: ContestState) -> int:
+        return max(self.inner.done(one) for one in state.each)
+
+    def kept(self, done: int) -> int:
+        """How many are in the contest after ``done`` steps."""
+        halvings = math.ceil(math.log2(self.contestants))
+        passed = sum(done >= self.total / 2**k for k in range(1, halvings + 1))
+        return math.ceil(self.contestants / 2**passed)
+
+    def advance(self, states: list[ContestState]) -> list[tuple[ContestState, Row]]:
+        return [self._advanced(state) for state in states]
+
+    def _advanced(self, state: ContestState) -> tuple[ContestState, Row]:
+        order = np.argsort(-np.asarray(state.worths), kind="stable")
+        each, worths, rows = list(state.each), np.full(len(order), -np.inf, "f4"), []
+        for i in map(int, order[: self.kept(self.done(state))]):
+            [(each[i], metrics)] = self.inner.advance([each[i]])
+            row, [(_, worths[i])] = self.inner.judge(each[i], metrics)
+            rows.append(row)
+        best = max(rows, key=lambda row: row["value"])
+        row = best | {"contestants": len(rows), "lost": sum(row["lost"] for row in rows)}
+        return ContestState(tuple(each), jnp.asarray(worths)), row
+
+    def judge(self, state: ContestState, metrics: Row) -> tuple[Row, Candidates]:
+        if not metrics:
+            judged = [self.inner.judge(one, metrics) for one in state.each]
+            candidates = [candidate for _, [candidate] in judged]
+            return max((row for row, _ in judged), key=lambda row: row["value"]), candidates
+        order = [int(i) for i in np.argsort(-np.asarray(state.worths), kind="stable")]
+        return metrics, [
+            (current(self.config, state.each[i].start, state.each[i].search), float(worth))
+            for i in order
+            if np.isfinite(worth := state.worths[i])
+        ]
+
+    def note(self, row: Row) -> str:
+        return f"{row['contestants']} in the contest  {self.inner.note(row)}"
+
+    def watched(self, state: ContestState) -> Any:
+        return [self.inner.watched(one) for one in state.each]
+
+    def rekey(self, state: ContestState, number: int) -> ContestState:
+        return state.replace(each=tuple(self.inner.rekey(one, number) for one in state.each))
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from .boards import Board, Task, board
+from .config import Objective
 from .controller import Controller, check_controller, check_form, check_robot
 from .criteria import (
     V1_DEFAULT,
@@ -23,6 +24,7 @@ from .criteria import (
     score_v1,
     score_v2,
     score_v3,
+    upright,
 )
 from .plant import Plant
 from .rollout import Trajectory, rollout
@@ -31,8 +33,8 @@ from .variations import LONGEST_DELAY
 
 __all__ = [
     "V1_DEFAULT", "V1_OFFICIAL", "V2_HARDWARE", "V2_OFFICIAL", "Criteria", "ScoreV2", "ScoreV3",
-    "criteria", "imperfect", "nominal", "nominal_run", "official", "performance", "score_v1",
-    "score_v2", "score_v3",
+    "combined", "criteria", "imperfect", "nominal", "nominal_run", "official", "performance",
+    "score_v1", "score_v2", "score_v3",
 ]  # fmt: skip
 
 
@@ -47,15 +49,31 @@ def performance(
     return task.criteria(run, scenario.plant if isinstance(scenario, Scenario) else scenario)
 
 
-def imperfect(controller: Controller, task: Task, key: jax.Array, count: int) -> Criteria:
-    """Criteria (count,) of runs in random imperfect scenarios of a task; ``key`` is consumed."""
+def imperfect(
+    controller: Controller, task: Task, key: jax.Array, count: int
+) -> tuple[Criteria, jax.Array]:
+    """Criteria (count,) of runs in random imperfect scenarios of a task, and which end upright.
+
+    Upright, (count,) bool, is meant as in the robustness benchmark. ``key`` is consumed.
+    """
     key_scenarios, key_runs = jax.random.split(key)
     scenarios = jax.vmap(task.sample)(jax.random.split(key_scenarios, count))
 
-    def one(scenario: Scenario, key: jax.Array) -> Criteria:
-        return performance(controller, scenario, key, task, delay_slots=LONGEST_DELAY + 1)
+    def one(scenario: Scenario, key: jax.Array) -> tuple[Criteria, jax.Array]:
+        options: dict[str, Any] = {"dt": task.dt, "duration": task.duration}
+        run = rollout(scenario, controller, key, delay_slots=LONGEST_DELAY + 1, **options)
+        return task.criteria(run, scenario.plant), upright(run.x[-1])
 
     return jax.vmap(one)(scenarios, jax.random.split(key_runs, count))
+
+
+def combined(
+    objective: Objective, score: jax.Array, met: tuple[Criteria, jax.Array], task: Task
+) -> jax.Array:
+    """What a controller is worth (), of its score () and of ``imperfect`` runs that it met."""
+    c, stands = met
+    outcome = stands if objective.outcome == "success" else task.score(c)
+    return (1 - objective.weight) * score + objective.weight * outcome.mean()
 
 
 @partial(jax.jit, static_argnames="task")

@@ -26,7 +26,7 @@ from .controllers.guard import guard
 from .controllers.policy import change_policies
 from .controllers.search_space import coordinates
 from .pytree import Pytree, pytree
-from .score import imperfect, performance
+from .score import combined, imperfect, performance
 from .stage import Candidates, Chart, Row, SearchStage, SearchState
 
 __all__ = [
@@ -53,8 +53,8 @@ def fitness(
 ) -> tuple[jax.Array, jax.Array]:
     """Fitness of a controller, to be maximised, and how many of its rollouts diverged.
 
-    The mean score of the task over noisy nominal rollouts; with ``config.scenarios``, its
-    weighted mean with the mean score over random imperfect scenarios of the task. ``task`` may be
+    The mean score of the task over noisy nominal rollouts; with ``config.scenarios`` what
+    ``score.combined`` makes of it and of random imperfect scenarios of the task. ``task`` may be
     left out for a controller that knows its robot (``boards.own_task``).
     """
     task = own_task(controller, task)
@@ -67,10 +67,9 @@ def fitness(
     c = jax.vmap(lambda k: performance(noisy, plant, k, task))(keys)
     score, diverged = task.score(c).mean(), jnp.sum(c.diverged)
     if config.scenarios:
-        c = imperfect(controller, task, key_scenarios, config.scenarios)
-        weight = config.scenario_weight
-        score = (1 - weight) * score + weight * task.score(c).mean()
-        diverged = diverged + jnp.sum(c.diverged)
+        met = imperfect(controller, task, key_scenarios, config.scenarios)
+        score = combined(config.objective, score, met, task)
+        diverged = diverged + jnp.sum(met[0].diverged)
     return score, diverged
 
 

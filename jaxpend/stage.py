@@ -8,16 +8,17 @@ the configuration.
 """
 
 from functools import partial
-from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import jax
+import jax.numpy as jnp
 
 from .boards import Task
-from .config import GradientConfig, Run, SNESConfig
+from .config import Objective, Run
 from .controller import Controller
 from .controllers.search_space import kinds
 from .pytree import Pytree, pytree
-from .score import imperfect, nominal
+from .score import combined, imperfect, nominal
 
 __all__ = ["Candidates", "Chart", "Row", "SearchStage", "SearchState", "Stage", "value"]
 
@@ -53,11 +54,12 @@ class Stage(Protocol[Before, State, After]):
     total: int
 
     @classmethod
-    def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
+    def of(cls, run: Run, start: Controller | None, task: Task) -> "Stage | None":
         """The stage that a configuration has; None: it has no such stage.
 
         ``start`` is a controller of the structure that the stage before ends with.
         """
+        return None
 
     def about(self) -> dict[str, Any]:
         """What others need to know of it, as plain values."""
@@ -103,25 +105,19 @@ class Stage(Protocol[Before, State, After]):
 VALIDATION_SEED = 2**31 - 1
 
 
-@partial(jax.jit, static_argnames=("task", "count"))
-def _validation(controller: Controller, task: Task, count: int) -> jax.Array:
-    """Mean score over random imperfect scenarios, always the same."""
-    key = jax.random.key(VALIDATION_SEED)
-    return task.score(imperfect(controller, task, key, count)).mean()
+@partial(jax.jit, static_argnames=("objective", "task"))
+def _validated(objective: Objective, controller: Controller, score: float, task: Task) -> jax.Array:
+    met = imperfect(controller, task, jax.random.key(VALIDATION_SEED), objective.validation)
+    return combined(objective, jnp.asarray(score), met, task)
 
 
-def value(
-    config: GradientConfig | SNESConfig, controller: Controller, score: float, task: Task
-) -> float:
+def value(objective: Objective, controller: Controller, score: float, task: Task) -> float:
     """What candidates are compared by, given their official score.
 
-    It is the score itself; of a search that meets scenarios its weighted mean with the mean score
-    over ``config.validation`` of them, which stay the same.
+    It is the score itself; of an objective that weighs scenarios it is ``score.combined`` on
+    ``objective.validation`` of them, which stay the same.
     """
-    if not config.scenarios:
-        return score
-    weight = config.scenario_weight
-    return (1 - weight) * score + weight * float(_validation(controller, task, config.validation))
+    return float(_validated(objective, controller, score, task)) if objective.weight else score
 
 
 @pytree
@@ -158,8 +154,10 @@ class SearchStage(Stage[Controller, SearchState, Controller]):
         """``SearchState.search`` after ``count`` steps, and their metrics (count,)."""
         raise NotImplementedError
 
-    def start(self, seed: int, before: Controller) -> SearchState:
-        return self.begin(seed, self.prepared(before))
+    def start(self, seed: int, before: Controller | tuple[Controller, ...]) -> SearchState:
+        """Of several controllers, the best first, it goes on from the first."""
+        first = before[0] if isinstance(before, tuple) else before
+        return self.begin(seed, self.prepared(first))
 
     def like(self) -> SearchState:
         return jax.eval_shape(partial(self.begin, 0), self.policy)
@@ -180,7 +178,7 @@ class SearchStage(Stage[Controller, SearchState, Controller]):
     def compared(self, controller: Controller) -> tuple[float, float]:
         """The official score of a candidate, and what it is compared by."""
         score = float(self.task.score(nominal(controller, self.task)))
-        return score, value(self.config, controller, score, self.task)
+        return score, value(self.config.objective, controller, score, self.task)
 
     def rekey(self, state: SearchState, number: int) -> SearchState:
         key = jax.random.fold_in(state.search.key, number)

@@ -92,7 +92,10 @@ def test_every_text_is_free_or_one_of_a_few():
         (lambda: SACConfig(steps=0), "steps is 0; it must be positive"),
         (lambda: SACConfig(actor_hidden=()), "actor_hidden is (); it must be one or more values"),
         (lambda: SACConfig(critic_hidden=(64, -5)), "each of which must be positive"),
-        (lambda: SACConfig(replay_capacity=31), "hold at least one step of all 32 environments"),
+        (
+            lambda: SACConfig(replay_capacity=31),
+            "it must hold n_step = 1 steps of all 32 environments",
+        ),
         (
             lambda: SACConfig(batch_size=1, demonstrations=DemonstrationConfig(episodes=1)),
             "batch_size is 1; it must be at least 2, half are demonstrations",

@@ -316,6 +316,19 @@ def test_a_share_of_episodes_starts_near_upright_and_only_there():
     assert starts[0].x[0] == 0 != starts[1].x[0]
 
 
+def test_a_share_of_episodes_starts_anywhere_among_those_that_do_not_start_upright():
+    env = make(upright_starts=0.25, upright_spread=1e-6, random_starts=0.5)
+    x = np.asarray(jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 4000)).x)
+    hanging = (x == 0).all(1)
+    up = ~hanging & (np.abs(x - [math.pi, 0, 0, 0]) < 1e-4).all(1)
+    np.testing.assert_allclose([hanging.mean(), up.mean()], 0.25, atol=0.03)
+    anywhere = x[~hanging & ~up]
+    # Uniform angles fill the circle, velocities are Gaussian.
+    np.testing.assert_allclose(anywhere[:, :2].std(0), math.pi / math.sqrt(3), rtol=0.05)
+    assert np.abs(anywhere[:, :2]).max() <= math.pi
+    np.testing.assert_allclose(anywhere[:, 2:].std(0), 5.0, rtol=0.1)
+
+
 def test_nobody_who_trains_waits_for_brax():
     code = "import sys, jaxpend.env, jaxpend.sac; assert 'brax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -337,6 +350,11 @@ def test_episode_steps():
         ({"upright_starts": -0.1}, "upright_starts is -0.1; it must not be negative"),
         ({"upright_spread": 0.0}, "upright_spread is 0.0; it must be positive"),
         ({"randomised": 1.5}, "randomised is 1.5; it must be at most 1"),
+        ({"random_starts": -0.5}, "random_starts is -0.5; it must not be negative"),
+        (
+            {"upright_starts": 0.5, "random_starts": 0.6},
+            "upright_starts and random_starts are 0.5 and 0.6; they are shares of one whole",
+        ),
     ],
 )
 def test_senseless_values_are_one_sentence(values, words):

@@ -11,8 +11,8 @@ from conftest import assert_close, refused, shipped_network, task_of
 from jax.flatten_util import ravel_pytree
 
 from jaxpend import Policy, Scenario, designs, gradient
-from jaxpend.config import GradientConfig
-from jaxpend.controllers import energy_shaping
+from jaxpend.config import GradientConfig, Objective
+from jaxpend.controllers import energy_shaping, guard
 from jaxpend.controllers.search_space import coordinates
 from jaxpend.plant import rk4_step
 from jaxpend.scenario import Pulses
@@ -108,7 +108,7 @@ def test_a_run_that_is_not_finite_is_left_out_and_counted(monkeypatch):
     slope = toy_slope(monkeypatch, lambda scenario: jnp.where(scenario.delay[0] > 0, jnp.nan, 2.0))
     start = network()
     z, _, _ = coordinates(start)
-    config = GradientConfig(scenarios=20, scenario_weight=0.25, clip=1e9)
+    config = GradientConfig(scenarios=20, objective=Objective(0.25), clip=1e9)
     ascent, lost, metrics = slope(config, start, TASK, z, KEY)
     assert 1 <= lost <= 10
     np.testing.assert_allclose(ascent, 0.75 * 1 + 0.25 * 2, rtol=1e-6)
@@ -126,7 +126,7 @@ def test_each_run_is_clipped_before_they_are_averaged(monkeypatch):
     z, _, _ = coordinates(start)
     plain = GradientConfig(clip=0.5)
     assert_close(jnp.linalg.norm(slope(plain, start, TASK, z, KEY)[0]), 0.5)
-    robust = GradientConfig(clip=0.5, scenarios=20, scenario_weight=1.0)
+    robust = GradientConfig(clip=0.5, scenarios=20, objective=Objective(1.0))
     ascent, lost, _ = slope(robust, start, TASK, z, KEY)
     assert lost == 0
     assert jnp.linalg.norm(ascent) < 0.5 * 10 / 20
@@ -146,6 +146,46 @@ def test_it_improves_the_policy_and_repeats_itself():
     np.testing.assert_array_equal(again.parameters, state.parameters)
 
 
+def test_what_a_policy_does_where_it_stands_is_retained(monkeypatch):
+    monkeypatch.setattr(gradient, "SHOWN", 12)
+    start = shipped_network()
+    config = GradientConfig(retention=1.0, retained_after=9.0, duration=0.1)
+    kept = jax.jit(gradient.retained, static_argnums=(0, 2))(config, start, TASK)
+    assert kept.obs.shape == (12 * 25, start.observation.size)
+    stands = np.asarray(kept.counts).reshape(12, 25)
+    assert (stands == stands[:, :1]).all()
+    assert 0 < stands[:, 0].sum() < 12
+    # Where it stands, cos theta1 is -1 and cos theta2 is 1.
+    up = np.asarray(kept.obs).reshape(12, 25, -1)[stands[:, 0] == 1]
+    cosines = sorted(np.abs(up[:, -1]).mean(0))[-2:]
+    np.testing.assert_allclose(cosines, 1.0, atol=0.05)
+    same = gradient.change(start, kept, KEY)
+    other = start.replace(layers=jax.tree.map(lambda leaf: 1.1 * leaf, start.layers))
+    assert same < 1e-9 < 1e-5 < gradient.change(other, kept, KEY)
+    # What fell counts nothing.
+    fell = kept.replace(action=kept.action + jnp.where(kept.counts == 0, 1.0, 0.0))
+    assert gradient.change(start, fell, KEY) < 1e-9
+
+
+def test_retention_pulls_back_to_what_the_start_did():
+    start = shipped_network()
+    config = GradientConfig(steps=30, retention=1e4, duration=0.02, learning_rate=1e-3)
+    begun = gradient.init(config, start, KEY, TASK)
+    away = begun.replace(parameters=begun.parameters + 0.01)
+    _, metrics = gradient.improve(config, start, away, 30, TASK)
+    assert metrics["change"][-5:].mean() < 0.5 * metrics["change"][0]
+    free = dataclasses.replace(config, retention=0.0)
+    assert gradient.init(free, start, KEY).retained is None
+
+
+def test_retention_is_of_a_policy_alone():
+    config = GradientConfig(retention=1.0)
+    with refused("it needs a policy without a guard"):
+        gradient.init(config, energy_shaping(designs.competition("acrobot"), "acrobot"), KEY)
+    with refused("it needs a policy without a guard"):
+        gradient.Gradient(config, guard(shipped_network(), "pendubot"), TASK)
+
+
 def test_jitted_as_eager():
     start, config = network(), GradientConfig(duration=0.1)
     arguments = config, start, TASK, coordinates(start)[0], KEY
@@ -157,7 +197,9 @@ def test_jitted_as_eager():
 
 def test_scenarios_come_from_the_key():
     start = network()
-    config = GradientConfig(steps=1, duration=0.02, scenario_duration=0.5, scenarios=2)
+    config = GradientConfig(
+        steps=1, duration=0.02, scenario_duration=0.5, scenarios=2, objective=Objective(0.8)
+    )
     ends = []
     for seed in (0, 0, 1):
         begun = gradient.init(config, start, jax.random.key(seed))
@@ -190,7 +232,8 @@ def test_gains_of_any_controller_climb_with_a_step_of_their_own():
         ({"clip": 0.0}, "clip is 0.0; it must be positive"),
         ({"memory": float("nan")}, "memory is nan; it must be positive"),
         ({"scenarios": -1}, "scenarios is -1; it must not be negative"),
-        ({"scenario_weight": 1.5}, "scenario_weight is 1.5; it must be at most 1"),
+        ({"scenarios": 4}, "scenarios is 4; with objective.weight 0 they count nothing"),
+        ({"retention": -1.0}, "retention is -1.0; it must not be negative"),
     ],
 )
 def test_senseless_values_are_one_sentence(values, words):

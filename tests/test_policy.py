@@ -86,7 +86,9 @@ def test_action_noise_is_drawn_before_the_squashing_and_anew_each_step():
     for _ in range(200):
         carry, torque = step(policy, carry)
         torques.append(torque[0])
-    noise = np.arctanh(np.array(torques) / 3.0) - float(policy.pre_action(STATE))
+    noise = np.arctanh(np.array(torques) / 3.0) - float(
+        policy.pre_action(policy.observation(STATE))
+    )
     np.testing.assert_allclose(noise.std(), 0.1, rtol=0.2)
     np.testing.assert_allclose(noise.mean(), 0.0, atol=0.03)
     assert len(np.unique(noise)) > 190

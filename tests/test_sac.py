@@ -14,7 +14,7 @@ import pytest
 from conftest import assert_close, refused
 
 from jaxpend.boards import v2
-from jaxpend.config import SACConfig
+from jaxpend.config import DemonstrationConfig, SACConfig
 from jaxpend.env import EnvConfig, EnvState
 from jaxpend.sac import algorithm as sac
 from jaxpend.sac import losses
@@ -283,6 +283,40 @@ def test_replay_holds_the_last_transitions_as_they_were():
         chex.assert_trees_all_equal(*kept)
 
 
+def test_several_steps_are_those_that_followed_as_far_as_the_episode_went():
+    """Rewards are 2^time in one environment and 3^time in the other: a sum says what is in it."""
+    agent = changed(REPLAY, n_step=3)
+    replay = sac.init(agent, KEY).replay  # of 3 times
+    like = jax.tree.map(lambda leaf: leaf[0, 0], replay.data)
+    replay = buffer.init(like, 6, 2, steps=3)
+    for time in range(8):  # the first two are written over
+        row = jnp.full((2, ROW), float(time)).at[:, 6].set(jnp.array([2.0, 3.0]) ** time)
+        replay = buffer.add(replay, transitions(row), jnp.array([time == 4, False]))
+    batch = buffer.sample_steps(replay, KEY, (4, 200), 3, 0.5)
+    first, reward = np.asarray(batch.obs[..., 0]), np.asarray(batch.reward)
+    last, discount = np.asarray(batch.next_obs[..., 0]), np.asarray(batch.discount)
+    ended = (reward == [[2.0**3 + 0.5 * 2.0**4]]) | (reward == 2.0**4)
+    expected_last = np.where(ended, 4, first + 2)
+    np.testing.assert_array_equal(last, expected_last)
+    np.testing.assert_array_equal(discount, 0.5 ** (last - first + 1))
+    seen = set(zip(first.ravel(), reward.ravel(), strict=True))
+    sums = {
+        (t, b**t + 0.5 * b ** (t + 1) + 0.25 * b ** (t + 2)) for t in range(2, 6) for b in (2, 3)
+    }
+    sums -= {(3, 2**3 + 2**3 + 2**3), (4, 2**4 + 2**4 + 2**4)}
+    assert seen == sums | {(3, 2**3 + 0.5 * 2**4), (4, 2.0**4)}
+
+
+def test_one_step_of_several_is_a_plain_step():
+    history = list(run_interaction(3))
+    replay = history[-1][1].replay
+    replay = replay.replace(cut=jnp.zeros(replay.data.action.shape, bool))
+    batch = buffer.sample_steps(replay, KEY, (50,), 1, 0.9)
+    np.testing.assert_allclose(batch.discount, 0.9, rtol=1e-6)
+    rows = {tuple(r) for r in columns(replay.data).reshape(-1, ROW)}
+    assert {tuple(r) for r in columns(batch.replace(discount=None))} == rows
+
+
 def test_actions_do_not_depend_on_what_only_the_critics_see():
     state = with_actor(sac.init(CREDIT, KEY), -1.0)
     envs = state.envs.replace(privileged=state.envs.privileged + 5)
@@ -311,6 +345,18 @@ def test_episodes_end_by_time_and_by_speed_and_start_anew():
         starts.extend(x[ended, 0])
     assert {(True, False), (False, True), (False, False)} <= cut_by
     assert len(set(starts)) == len(starts) > 8  # a fresh key at every reset
+
+
+def test_where_episodes_end_is_kept_for_several_steps():
+    agent = changed(REPLAY, n_step=2)
+    state = sac.init(agent, KEY)
+    assert state.replay.cut.shape == (3, 4)
+    for k in range(6):
+        after = interact(agent, state, jax.random.key(k))[0]
+        ended = np.asarray(after.env_time) == 0
+        np.testing.assert_array_equal(after.replay.cut[k % 3], ended)
+        state = after
+    assert sac.init(REPLAY, KEY).replay.cut is None
 
 
 def test_environments_start_at_different_times_of_the_episode():
@@ -350,7 +396,7 @@ def test_demonstrations_fill_the_front_of_a_buffer_of_one_environment():
 def test_what_does_not_fit_together_is_said_at_trace_time():
     state, batch = sac.init(REPLAY, KEY), batch_of(CREDIT)
     with pytest.raises(AssertionError, match="shape"):
-        buffer.add(state.replay, batch)  # 64 environments into a buffer of 4
+        buffer.add(state.replay, batch, jnp.zeros(64, bool))  # 64 environments into a buffer of 4
     with pytest.raises(AssertionError, match="shape"):
         losses.soft_target(batch.reward[:, None], batch.reward, batch.reward, 0.9)
     with pytest.raises(AssertionError, match="rank"):
@@ -405,7 +451,13 @@ def test_learning_rate_decays_over_the_whole_run():
         ({"steps": 0}, "steps is 0; it must be positive"),
         ({"learning_rate": -1.0}, "learning_rate is -1.0; it must be positive"),
         ({"discount": 1.0}, "discount is 1.0; it must be below 1"),
-        ({"num_envs": 8, "replay_capacity": 7}, "must hold at least one step of all"),
+        ({"num_envs": 8, "replay_capacity": 7}, "it must hold n_step = 1 steps of all 8"),
+        ({"num_envs": 8, "replay_capacity": 23, "n_step": 3}, "it must hold n_step = 3 steps"),
+        ({"n_step": 0}, "n_step is 0; it must be at least 1"),
+        (
+            {"n_step": 2, "demonstrations": DemonstrationConfig(episodes=1)},
+            "n_step is 2; with demonstrations it must be 1",
+        ),
         ({"activation": "exp"}, "activation is 'exp'; it must be relu, tanh or silu"),
     ],
 )

@@ -10,6 +10,7 @@ import pytest
 from conftest import assert_close, refused, shipped_network, task_of
 
 from jaxpend import Policy, designs, snes
+from jaxpend.config import Objective
 from jaxpend.controllers import load_reference, lqr, tvlqr
 from jaxpend.controllers.hybrid import with_lqr
 from jaxpend.score import Criteria, official, performance, score_v2
@@ -217,13 +218,14 @@ def test_scenarios_have_their_weight_in_the_fitness(monkeypatch):
     def imperfect(controller, task, key, count):
         assert controller is NETWORK
         assert count == 5
-        return perfect
+        return perfect, jnp.arange(5) > 3
 
     monkeypatch.setattr(snes, "imperfect", imperfect)
-    config = dataclasses.replace(QUIET, scenarios=5, scenario_weight=0.25)
-    score, _ = jax.jit(partial(snes.fitness, config, NETWORK, task=TASK))(KEY)
     nominal = official(NETWORK, "pendubot")["score"]
-    np.testing.assert_allclose(score, 0.75 * nominal + 0.25 * 0.6, atol=2e-3)
+    for outcome, mean in (("score", 0.6), ("success", 0.2)):
+        config = dataclasses.replace(QUIET, scenarios=5, objective=Objective(0.25, outcome))
+        score, _ = jax.jit(partial(snes.fitness, config, NETWORK, task=TASK))(KEY)
+        np.testing.assert_allclose(score, 0.75 * nominal + 0.25 * mean, atol=2e-3)
 
 
 def test_any_controller_has_a_fitness_and_only_policies_have_action_noise(fit):
@@ -270,7 +272,7 @@ def test_a_generation_meets_one_noise_and_improves_the_policy(fit):
         ({"strategy": "ga"}, "strategy is 'ga'; it must be snes, sep_cma_es, lm_ma_es or"),
         ({"strategy": "open_es", "population": 5}, "population is 5; open_es needs pairs"),
         ({"scenarios": -1}, "scenarios is -1; it must not be negative"),
-        ({"scenario_weight": 1.5}, "scenario_weight is 1.5; it must be at most 1"),
+        ({"scenarios": 4}, "scenarios is 4; with objective.weight 0 they count nothing"),
     ],
 )
 def test_senseless_values_are_one_sentence(values, words):

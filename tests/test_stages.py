@@ -13,18 +13,31 @@ from training_runs import events_of, rows_of
 
 from jaxpend import Policy, save_policy, stage
 from jaxpend.boards import v2
-from jaxpend.config import GradientConfig, SNESConfig, SNESRun
-from jaxpend.gradient import Gradient
+from jaxpend.config import (
+    DemonstrationConfig,
+    GradientConfig,
+    Objective,
+    SACConfig,
+    SACRun,
+    SNESConfig,
+    SNESRun,
+    TrainRun,
+)
+from jaxpend.gradient import Contest, Gradient
 from jaxpend.pytree import Pytree, pytree
 from jaxpend.report import page
 from jaxpend.runs.reader import find, listing, remarks
-from jaxpend.sac.stage import chunk_length
+from jaxpend.sac.stage import SAC, Attempts, chunk_length
 from jaxpend.score import Criteria, nominal, score_v2
 from jaxpend.snes import SNES
 from jaxpend.train import train
 from jaxpend.train.interrupt import Stopped
 
 TASK = v2("pendubot").task
+
+
+def stands(count):
+    return jnp.arange(count) % 8 == 0
 
 
 @pytest.fixture
@@ -34,18 +47,18 @@ def met(monkeypatch):
 
     def imperfect(controller, task, key, count):
         counts.append(count)
-        return Criteria(*jnp.zeros((9, count)), success=jnp.arange(count) % 4 > 0)
+        return Criteria(*jnp.zeros((9, count)), success=jnp.arange(count) % 4 > 0), stands(count)
 
     monkeypatch.setattr(stage, "imperfect", imperfect)
-    stage._validation.clear_cache()
+    stage._validated.clear_cache()
     yield counts
-    stage._validation.clear_cache()
+    stage._validated.clear_cache()
 
 
 @pytest.mark.parametrize(
     ("kind", "config"),
     [
-        (Gradient, GradientConfig(scenarios=2, scenario_weight=0.25, validation=8)),
+        (Gradient, GradientConfig(scenarios=2, objective=Objective(0.25, validation=8))),
         (Gradient, GradientConfig()),
         (SNES, SNESConfig(population=2, action_noise=0.0)),
     ],
@@ -64,11 +77,21 @@ def test_candidates_are_compared_by_score_and_by_scenarios_that_stay_the_same(me
     np.testing.assert_allclose(found, score, rtol=1e-5)
 
 
-def test_scenarios_count_in_either_search(met):
-    for config in (GradientConfig(scenarios=1), SNESConfig(scenarios=1)):
-        weight = config.scenario_weight
-        assert stage.value(config, None, 0.5, TASK) == 0.5 * (1 - weight) + 0.75 * weight
-    assert met == [256]  # compiled once for both
+def test_what_becomes_of_scenarios_counts_as_much_as_the_objective_says(met):
+    for outcome, mean in (("score", 0.75), ("success", 0.125)):
+        found = stage.value(Objective(0.25, outcome), None, 0.5, TASK)
+        np.testing.assert_allclose(found, 0.75 * 0.5 + 0.25 * mean, rtol=1e-6)
+    assert stage.value(Objective(), None, 0.5, TASK) == 0.5
+    assert met == [256, 256]
+
+
+def test_the_best_policy_of_sac_is_that_of_its_objective(met):
+    config = SACConfig(num_envs=1, actor_hidden=(4,), objective=Objective(0.5, "success", 16))
+    search = SAC(config, TASK)
+    row, [(_, worth)] = search.judge(search.start(0, None), {})
+    assert row["score"] == 0  # an untrained policy does not stand
+    np.testing.assert_allclose([worth, row["value"]], 0.5 * 0.125, rtol=1e-6)
+    assert met == [16]
 
 
 # --- a new stage ---------------------------------------------------------------------------
@@ -209,3 +232,80 @@ def test_chunks_are_of_one_length_where_they_can_be():
     assert chunk_length(3, 8) == 8  # less than a chunk in all: ``advance`` makes it shorter
     assert chunk_length(10_007, 100) == 100  # a prime: the last one is shorter
     assert chunk_length(5, 1) == 1
+
+
+# --- attempts and contests -----------------------------------------------------------------
+
+
+def test_attempts_begin_anew_and_the_best_policy_of_each_goes_on(monkeypatch):
+    config = SACConfig(
+        steps=8, num_envs=4, attempts=2, eval_every=4, replay_capacity=64, warmup_steps=100,
+        actor_hidden=(4,), critic_hidden=(4,),
+    )  # fmt: skip
+    worths = iter([0.1, 0.5, 0.2, 0.3, 0.9])  # at the start, then twice an attempt
+    monkeypatch.setattr("jaxpend.sac.stage.value", lambda *rest: next(worths))
+    search = SAC.of(SACRun(sac=config), None, TASK)
+    assert (type(search), search.total) == (Attempts, 16)
+    state = search.start(0, None)
+    search.judge(state, {})
+    seen = []
+    while search.done(state) < search.total:
+        [(state, row)] = search.advance([state])
+        _, [(last, worth)] = search.judge(state, row)
+        seen.append((search.done(state), row["attempt"], worth, last))
+    assert [entry[:3] for entry in seen] == [(4, 1, 0.5), (8, 1, 0.2), (12, 2, 0.3), (16, 2, 0.9)]
+    first, second = (seen[i][3].layers[0][0] for i in (0, 3))
+    assert not np.array_equal(first, second)  # a key of its own
+    np.testing.assert_allclose(state.worths, [0.5, 0.9])
+    best = search.outcome(state, None)
+    np.testing.assert_array_equal(best[0].layers[0][0], second)
+    np.testing.assert_array_equal(best[1].layers[0][0], first)
+    # What goes on from one controller takes the best.
+    after = SNES(SNESConfig(population=2), shipped_network(), TASK).start(0, best)
+    np.testing.assert_array_equal(after.start.layers[0][0], second)
+
+
+def test_a_contest_leaves_out_half_again_and_again(monkeypatch):
+    """What a contestant is worth is a number that it carries."""
+    policies = tuple(shipped_network(bias=b) for b in (0.3, 0.1, 0.4, 0.2))
+
+    def bias(policy):
+        return float(policy.layers[-1][1][0])
+
+    origin = bias(shipped_network())
+    config = GradientConfig(steps=8, chunk=1)
+    run = TrainRun(gradient=config, sac=SACConfig(attempts=4))
+    contest = Gradient.of(run, policies[0], TASK)
+    assert type(contest) is Contest
+    moves = []
+
+    def search(states, count):
+        moves.append(round(bias(states[0].start) - origin, 3))
+        return [(states[0].search, {"smooth_score": jnp.ones(1)})]
+
+    monkeypatch.setattr(contest.inner, "search", search)
+    monkeypatch.setattr(contest.inner, "compared", lambda p: (0.0, bias(p) - origin))
+    state = contest.start(0, policies)
+    assert len(contest.judge(state, {})[1]) == 4
+    kept = []
+    while contest.done(state) < contest.total:
+        moves.clear()
+        [(state, row)] = contest.advance([state])
+        row, candidates = contest.judge(state, row)
+        assert row["contestants"] == len(moves) == len(candidates)
+        np.testing.assert_allclose(candidates[0][1], 0.4, atol=1e-5)
+        kept.append(sorted(moves))
+    assert kept == [[0.1, 0.2, 0.3, 0.4]] * 2 + [[0.3, 0.4]] * 2 + [[0.4]] * 4
+
+
+@pytest.mark.parametrize(("contestants", "kept"), [(2, "2211"), (3, "3221"), (5, "5321")])
+def test_the_last_halving_is_in_the_middle(contestants, kept):
+    contest = Contest(GradientConfig(steps=80), shipped_network(), TASK, contestants)
+    times = {2: (0, 39, 40, 79), 3: (0, 20, 39, 40), 5: (9, 10, 20, 40)}[contestants]
+    assert [contest.kept(done) for done in times] == list(map(int, kept))
+    assert contest.kept(79) == 1
+
+
+def test_demonstrations_are_for_one_attempt():
+    with refused("attempts is 2; with demonstrations it must be 1"):
+        SACConfig(attempts=2, demonstrations=DemonstrationConfig(episodes=1))

@@ -22,7 +22,7 @@ from ..robots import ROBOTS, shipped
 from ..trajopt.ilqr import Solution
 from ..trajopt.reference import Reference
 from .energy import EnergyShaping
-from .guard import Guarded, Observer, Rescue
+from .guard import Guarded, KalmanFilter, Observer, Rescue
 from .hybrid import Ellipsoid, Hybrid, Tolerances
 from .lqr import LQR
 from .mpc import MPC
@@ -39,8 +39,8 @@ FORMAT = 1
 # What files of earlier versions call classes and fields.
 FORMER = {"Nominal": "Reference", "nominal": "reference"}
 CLASSES = (
-    EnergyShaping, Ellipsoid, Guarded, Hybrid, LQR, MPC, Observation, Observer, OpenLoop, PD,
-    Plant, Policy, Reference, Rescue, Riccati, Solution, TVLQR, Tolerances, Zero,
+    EnergyShaping, Ellipsoid, Guarded, Hybrid, KalmanFilter, LQR, MPC, Observation, Observer,
+    OpenLoop, PD, Plant, Policy, Reference, Rescue, Riccati, Solution, TVLQR, Tolerances, Zero,
 )  # fmt: skip
 SLOWEST = 1.0  # s, the longest control period that a policy may say it was trained at
 

@@ -1,14 +1,18 @@
 """An observer and a rescue around a controller, for plants and sensors that are not nominal.
 
-An extended state observer (Han, "From PID to active disturbance rejection control", 2009) estimates
-state and disturbance from the measured *angles* and the applied torque, so that neither noise nor
-delay of the velocity measurement reaches the controller:
+The observer is a Kalman filter (Kalman, 1960) on the nominal model. Beside the state it estimates
+the acceleration ``d`` that the model does not explain, which it takes for a random walk, and each
+joint has a filter of its own for (angle, velocity, d):
 
-    x-  = f(x, u) + (d dt^2 / 2, d dt),   e = q - q-,   x = x- + (l1 e, l2 e),   d = d + l3 e
+    x-  = f(x, u) + (d dt^2 / 2, d dt),   e = z - x-,   x = x- + K e,   d = d + k e
 
-with ``f`` one integration step of the nominal plant and ``d`` (rad/s^2) the acceleration that it
-does not explain. All three poles of the linear error lie at the bandwidth. On the nominal plant
-the estimate is exact but for rounding.
+with ``f`` one integration step, ``z`` the measured state and gains K, k of the filter. How noisy
+angles and velocities are is not known before, and it is estimated from what is measured: noise
+changes the innovation ``e`` from call to call, a wrong model or a delay moves it slowly, so that
+half the mean square of its change is the variance of the noise (compare Mehra, "Approaches to
+adaptive filtering", 1972). Velocities that are noisy are then hardly looked at, and neither are
+angles; where only one of them is noisy the other one leads. On the nominal plant the estimate is
+exact but for rounding.
 
 A swing-up that has failed is left to a rescue: a controller for which time does not matter, such
 as energy shaping with LQR at the top. It takes over when the top is not reached in time, or when
@@ -16,23 +20,25 @@ there is more energy than a swing-up needs: a motor that goes on pushing would t
 faster than it can be stopped. It keeps control until the end of the run.
 """
 
+import math
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from ..controller import Controller, check_controller, check_robot
+from ..criteria import upright
 from ..designs import competition
 from ..errors import JaxpendError
 from ..plant import UPRIGHT, Plant, deviation, rk4_step, total_energy
 from ..pytree import Pytree, pytree, static
+from ..rollout import rollout
 from ..scenario import DT
 from .energy import energy_shaping
 from .hybrid import with_lqr
 from .search_space import FACTOR
 
-__all__ = ["Guarded", "Observer", "Rescue", "guard", "observer"]
+__all__ = ["Guarded", "KalmanFilter", "Observer", "Rescue", "guard", "observer"]
 
 # How far LQR is trusted when it ends a rescue: ``fraction`` and ``hysteresis`` of its ellipsoid.
 # Chosen on random scenarios by experiments/guard.py, as is all below.
@@ -43,22 +49,130 @@ REGION = {
 # J, of the energy that a rescue aims at (``EnergyShaping``), for a plant that is heavier than the
 # model or has friction; the acrobot is better off without.
 SURPLUS = {"acrobot": None, "pendubot": 0.7}
+MARGIN = 1.1  # of time and energy, beyond what the controller needs on the nominal plant
+
+
+FORGETTING = 0.1  # s, the time over which noise is averaged
+
+
+@pytree
+class Seen(Pytree):
+    """What a Kalman filter knows; the last axis of (..., 2) is the joint."""
+
+    started: jax.Array  # () bool
+    x: jax.Array  # (4,) estimated state
+    d: jax.Array  # (2,) rad/s^2, acceleration that the model does not explain
+    torque: jax.Array  # (2,) N m, applied since
+    covariance: jax.Array  # (3, 3, 2) of the errors of angle, velocity and d
+    innovation: jax.Array  # (2, 2) the last one, of angles and of velocities
+    change: jax.Array  # (2, 2) its mean squared change
+
+
+@pytree
+class KalmanFilter(Pytree):
+    """Estimates the state from measurements of unknown noise; its memory is ``Seen``."""
+
+    plant: Plant  # the model; its torque limit clips what was asked for
+    least: jax.Array  # (2,) rad and rad/s, the least noise of angles and of velocities
+    disturbance: jax.Array  # () rad/s^2 per root second, how fast d wanders
+    dt: float = static(default=DT)  # s, between calls
+
+    def reset(self) -> Seen:
+        """Memory before the first measurement."""
+        two, four = jnp.zeros((2, 2)), jnp.zeros(4)
+        spread = jnp.stack([self.least[0] ** 2, jnp.ones(()), FORGETTING * self.disturbance**2])
+        covariance = jnp.eye(3)[..., None] * jnp.broadcast_to(spread[:, None, None], (3, 1, 2))
+        return Seen(jnp.array(False), four, four[:2], four[:2], covariance, two, two)
+
+    def _shifted(self, rows: jax.Array) -> jax.Array:
+        """Angle, velocity and acceleration (3, ...) one call later."""
+        dt = self.dt
+        angle = rows[0] + dt * rows[1] + 0.5 * dt**2 * rows[2]
+        return jnp.stack([angle, rows[1] + dt * rows[2], rows[2]])
+
+    def __call__(self, memory: Seen, measured: jax.Array) -> tuple[Seen, jax.Array]:
+        """New memory and estimated state (4,), at first the measured one, of a measurement (4,)."""
+        dtype, started = memory.x.dtype, memory.started
+        ahead = rk4_step(self.plant, memory.x, memory.torque, self.dt)
+        ahead = ahead + jnp.concatenate([0.5 * self.dt**2 * memory.d, self.dt * memory.d])
+        innovation = (measured - ahead).reshape(2, 2)
+        change = (innovation - memory.innovation) ** 2
+        change = memory.change + (change - memory.change) * self.dt / FORGETTING
+        noise = jnp.maximum(0.5 * change, (self.least**2)[:, None])
+
+        # P = F P F' + Q, in which the shift by F is applied to rows and to columns.
+        p = self._shifted(self._shifted(memory.covariance).swapaxes(0, 1))
+        p = p.at[2, 2].add(self.disturbance**2 * self.dt)
+        correction = jnp.zeros((3, 2))
+        for i in range(2):  # one measured value after the other, so that nothing is inverted
+            gain = p[:, i] / (p[i, i] + noise[i])
+            correction = correction + gain * (innovation[i] - correction[i])
+            p = p - gain[:, None] * p[i]
+
+        estimate = jnp.where(started, ahead + correction[:2].reshape(4), measured).astype(dtype)
+        true, d, torque = jnp.array(True), memory.d + correction[2], memory.torque
+        after = Seen(true, estimate, d, torque, p, innovation, change)
+        # The first measurement has nothing that it could be compared with.
+        first = memory.replace(started=true, x=estimate)
+
+        def chosen(new, old):
+            return jnp.where(started, new, old).astype(old.dtype)
+
+        return jax.tree.map(chosen, after, first), estimate
+
+    def applied(self, memory: Seen, torque: jax.Array) -> Seen:
+        """Memory that knows the torque (2,), N m, asked for since the last estimate."""
+        limit = self.plant.torque_limit
+        return memory.replace(torque=jnp.clip(torque, -limit, limit).astype(memory.torque.dtype))
+
+
+def observer(
+    plant: Plant,
+    *,
+    angle_noise: float = 1e-4,
+    velocity_noise: float = 0.2,
+    disturbance: float = 300.0,
+    dt: float = DT,
+) -> KalmanFilter:
+    """The observer of a plant, called every ``dt`` s.
+
+    Args:
+        plant: the model.
+        angle_noise: rad, standard deviation of measured angles, at least.
+        velocity_noise: rad/s, of measured velocities, at least. Velocities that are not noisy may
+            still be late, and are not believed more than that.
+        disturbance: rad/s^2 per root second, how fast an acceleration changes that the model does
+            not explain. More follows a wrong model faster, less averages more noise away.
+        dt: s.
+
+    Raises:
+        JaxpendError: a value that is not positive and finite.
+    """
+    values = {"angle_noise": (angle_noise, "rad"), "velocity_noise": (velocity_noise, "rad/s")}
+    values |= {"disturbance": (disturbance, "rad/s^2"), "dt": (dt, "s")}
+    for name, (value, unit) in values.items():
+        if not (math.isfinite(value) and value > 0):
+            raise JaxpendError(f"{name} is {value} {unit}; it must be positive and finite")
+    least = jnp.asarray([angle_noise, velocity_noise])
+    return KalmanFilter(plant, least, jnp.asarray(disturbance, least.dtype), dt)
 
 
 @pytree
 class Observer(Pytree):
-    """Estimates the state from measured angles; its memory is (started, x, d, torque)."""
+    """The observer of policy files of version 0.2, which believes measured angles alone.
 
-    plant: Plant  # the model; its torque limit clips what was asked for
+    An extended state observer (Han, "From PID to active disturbance rejection control", 2009);
+    its memory is (started, x, d, torque), its methods are those of ``KalmanFilter``.
+    """
+
+    plant: Plant
     gain: jax.Array  # (3,) l1, l2 (1/s), l3 (1/s^2)
     dt: float = static(default=DT)  # s, between calls
 
     def reset(self):
-        """Memory before the first measurement."""
         return jnp.array(False), jnp.zeros(4), jnp.zeros(2), jnp.zeros(2)
 
     def __call__(self, memory, measured: jax.Array):
-        """New memory and estimated state (4,), at first the measured one, of a measurement (4,)."""
         started, x, d, torque = memory
         ahead = rk4_step(self.plant, x, torque, self.dt)
         ahead = ahead + jnp.concatenate([0.5 * self.dt**2 * d, self.dt * d])
@@ -69,24 +183,13 @@ class Observer(Pytree):
         return (jnp.array(True), estimate, d, torque), estimate
 
     def applied(self, memory, torque: jax.Array):
-        """Memory that knows the torque (2,), N m, asked for since the last estimate."""
         limit = self.plant.torque_limit
         return (*memory[:3], jnp.clip(torque, -limit, limit).astype(memory[3].dtype))
 
 
-def observer(plant: Plant, bandwidth: float, *, dt: float = DT) -> Observer:
-    """The observer of a plant with all error poles at ``bandwidth`` (rad/s), called every ``dt`` s.
-
-    Raises ``JaxpendError`` if bandwidth or dt is not positive.
-    """
-    if not (bandwidth > 0 and dt > 0):
-        raise JaxpendError(f"bandwidth = {bandwidth} rad/s and dt = {dt} s must be positive")
-    # Ackermann's formula for the triple integrator whose error is corrected after predicting.
-    a = np.array([[1, dt, dt**2 / 2], [0, 1, dt], [0, 0, 1]])
-    seen = np.vstack([a[0] @ np.linalg.matrix_power(a, k) for k in range(3)])
-    wanted = np.linalg.matrix_power(a - np.exp(-bandwidth * dt) * np.eye(3), 3)
-    gain = wanted @ np.linalg.solve(seen, np.array([0.0, 0.0, 1.0]))
-    return Observer(plant, jnp.asarray(gain), dt)
+def surplus(plant: Plant, x: jax.Array) -> jax.Array:
+    """Energy () of state ``x`` (4,) above that of upright, J."""
+    return total_energy(plant, x) - total_energy(plant, jnp.array(UPRIGHT, x.dtype))
 
 
 @pytree
@@ -100,15 +203,16 @@ class Rescue(Pytree):
     excess: jax.Array | None = None  # () J, more energy than at upright; None: not looked at
     plant: Plant | None = None  # the model, for the energy
 
+    def away(self, x: jax.Array) -> jax.Array:
+        """Whether an angle of state ``x`` (4,) is not within ``radius`` of upright."""
+        return jnp.max(jnp.abs(deviation(x, jnp.array(UPRIGHT, x.dtype))[:2])) > self.radius
+
     def failed(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """Whether a swing-up that works would not be in state ``x`` (4,) at time ``t`` (s)."""
-        upright = jnp.array(UPRIGHT, x.dtype)
-        away = jnp.max(jnp.abs(deviation(x, upright)[:2])) > self.radius
-        failed = (t > self.after) & away
+        failed = (t > self.after) & self.away(x)
         if self.excess is None or self.plant is None:
             return failed
-        surplus = total_energy(self.plant, x) - total_energy(self.plant, upright)
-        return failed | (surplus > self.excess)
+        return failed | (surplus(self.plant, x) > self.excess)
 
 
 @pytree
@@ -116,7 +220,7 @@ class Guarded(Pytree):
     """``main`` behind an observer, before a rescue; either may be None."""
 
     main: Any
-    observer: Observer | None = None
+    observer: KalmanFilter | Observer | None = None
     rescue: Rescue | None = None
 
     def reset(self, key: jax.Array):
@@ -144,12 +248,36 @@ class Guarded(Pytree):
         return (seen, lost, memory), torque
 
 
+def _patient(main: Controller, plant: Plant, rescue: Rescue) -> Rescue:
+    """A rescue that waits longer, or for more energy, if ``main`` needs that on the nominal plant.
+
+    A swing-up that works is not interrupted, however slow it is.
+    """
+    x = _alone(main, plant)
+    if not upright(x[-1]) or rescue.excess is None:
+        return rescue
+    late = DT * jnp.max(jnp.where(jax.vmap(rescue.away)(x), jnp.arange(len(x)), 0))
+    most = jax.vmap(surplus, (None, 0))(plant, x).max()
+    return rescue.replace(
+        after=jnp.maximum(rescue.after, MARGIN * late).astype(rescue.after.dtype),
+        excess=jnp.maximum(rescue.excess, MARGIN * most).astype(rescue.excess.dtype),
+    )
+
+
+@jax.jit
+def _alone(main: Controller, plant: Plant) -> jax.Array:
+    """True states of a run on the nominal plant."""
+    return rollout(plant, main, jax.random.key(0)).x
+
+
 def guard(
     main: Controller,
     robot: str,
     plant: Plant | None = None,
     *,
-    bandwidth: float = 800.0,
+    observe: bool = True,
+    angle_noise: float = 1e-4,
+    velocity_noise: float = 0.2,
     rescue: bool = True,
     after: float = 2.0,
     radius: float = 0.3,
@@ -158,14 +286,17 @@ def guard(
     """A controller guarded by a model of the plant.
 
     Args:
-        main: the controller; without observer and rescue it is returned as it is.
+        main: the controller, concrete arrays; without observer and rescue it is returned as it is.
         robot: "acrobot" or "pendubot".
         plant: the model, concrete arrays; None: the competition's, ``designs.competition``.
-        bandwidth: rad/s, of the observer; 0 leaves it out. Less where angles are noisy.
+        observe: whether the controller sees the estimate of ``observer`` and not what is measured.
+        angle_noise: rad, see ``observer``.
+        velocity_noise: rad/s, see ``observer``.
         rescue: whether energy shaping and LQR take over a swing-up that failed.
-        after: s, the time that a swing-up may take.
+        after: s, the time that a swing-up may take; longer where ``main`` takes longer and stands.
         radius: rad, of either angle around upright; beyond it a swing-up has failed.
-        excess: J; with more than that above the energy of upright it has failed at any time.
+        excess: J; with more than that above the energy of upright it has failed at any time, or
+            with more than ``main`` needs on the nominal plant.
 
     Raises:
         JaxpendError: an unknown robot, no controller or one of the other robot, or a value out
@@ -178,13 +309,15 @@ def guard(
         raise JaxpendError(
             f"after = {after} s, radius = {radius} rad and excess = {excess} J must be positive"
         )
-    seeing = observer(plant, bandwidth) if bandwidth else None
+    noise = {"angle_noise": angle_noise, "velocity_noise": velocity_noise}
+    seeing = observer(plant, **noise) if observe else None
     rescuing = None
     if rescue:
         pumping = energy_shaping(plant, robot, surplus=SURPLUS[robot])
         swingup = with_lqr(pumping, plant, robot, **REGION[robot])
         limits = [jnp.asarray(limit) for limit in (after, radius, excess)]
         rescuing = Rescue(swingup, limits[0], limits[1], limits[2], plant)
+        rescuing = _patient(main, plant, rescuing)
     if seeing is None and rescuing is None:
         return main
     return Guarded(main, seeing, rescuing)

@@ -73,9 +73,9 @@ class Policy(Pytree):
     activation: str = static(default="relu")
     control_dt: float = static(default=0.01)  # s, the period it was trained at
 
-    def pre_action(self, x: jax.Array, past: jax.Array | None = None) -> jax.Array:
-        """The action before the tanh, scalar, for a measured state (4,) and ``Memory.past``."""
-        h = self.observation(x, past)
+    def pre_action(self, obs: jax.Array) -> jax.Array:
+        """The action before the tanh, scalar, for an observation (``observation.size``,)."""
+        h = obs
         *hidden, (kernel, bias) = self.layers
         for w, b in hidden:
             h = ACTIVATIONS[self.activation](h @ w + b)
@@ -90,12 +90,17 @@ class Policy(Pytree):
             memory = Memory(states, jnp.zeros(calls, dtype), zero, zero - jnp.inf)
         return None if self.action_noise is None else key, memory
 
-    def __call__(self, carry, t, x):
-        """Torque (2,), N m, zero on the passive joint."""
-        (key, memory), past = carry, None
+    def look(self, carry, t: jax.Array, x: jax.Array) -> jax.Array:
+        """What is seen (``observation.size``,) at time ``t`` in a measured state (4,)."""
+        memory, past = carry[1], None
         if memory is not None:
             past = memory.past(self.observation.history, self.control_dt, t, x)
-        pre = self.pre_action(x, past)
+        return self.observation(x, past)
+
+    def __call__(self, carry, t, x):
+        """Torque (2,), N m, zero on the passive joint."""
+        key, memory = carry
+        pre = self.pre_action(self.look(carry, t, x))
         if self.action_noise is not None:
             key, key_noise = jax.random.split(key)
             pre = pre + self.action_noise * jax.random.normal(key_noise, (), pre.dtype)

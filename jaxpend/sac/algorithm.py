@@ -149,7 +149,7 @@ def _fresh(agent: Agent, key: jax.Array) -> SACState:
     zero = jnp.zeros((), jnp.int32)
     actor = agent.actor.init(key_actor, one.obs)
     critic = agent.critic.init(key_critic, one.obs, one.privileged, one.action)
-    log_temperature = jnp.log(jnp.asarray(config.init_temperature))
+    log_temperature = jnp.log(jnp.asarray(config.init_temperature, jnp.float32))
     like, recipe = Transition.between(one, one.action, one, 1.0), config.demonstrations
     demonstrations = None
     if recipe.episodes:
@@ -163,7 +163,9 @@ def _fresh(agent: Agent, key: jax.Array) -> SACState:
         actor_opt=opt.init(actor),
         critic_opt=opt.init(critic),
         temperature_opt=opt.init(log_temperature),
-        replay=replay.init(like, config.replay_capacity // config.num_envs, config.num_envs),
+        replay=replay.init(
+            like, config.replay_capacity // config.num_envs, config.num_envs, steps=config.n_step
+        ),
         demonstrations=demonstrations,
         envs=envs,
         # Spread out, so that the environments are not all in the same phase of an episode.
@@ -187,8 +189,9 @@ def update(
     temperature = jnp.exp(state.log_temperature)
 
     next_action, log_prob = act(actor, state.actor, batch.next_obs, key_critic)
+    discount = config.discount if batch.discount is None else batch.discount
     (loss_q, value), grads = jax.value_and_grad(critic.loss, has_aux=True)(
-        state.critic, state.target, batch, next_action, temperature * log_prob, config.discount
+        state.critic, state.target, batch, next_action, temperature * log_prob, discount
     )
     updates, critic_opt = opt.update(grads, state.critic_opt)
     critic_params = optax.apply_updates(state.critic, updates)
@@ -243,7 +246,7 @@ def interact(agent: Agent, state: SACState, key: jax.Array) -> tuple[SACState, j
         return jnp.where(truncated.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
 
     state = state.replace(
-        replay=replay.add(state.replay, now),
+        replay=replay.add(state.replay, now, truncated),
         envs=jax.tree.map(restart, fresh, after),
         env_time=jnp.where(truncated, 0, state.env_time + 1),
         env_steps=state.env_steps + config.num_envs,
@@ -260,7 +263,10 @@ def sample(agent: Agent, state: SACState, key: jax.Array) -> Transition:
     config = agent.config
     if config.mirror:
         key, key_mirror = jax.random.split(key)
-    if state.demonstrations is None:
+    if config.n_step > 1:
+        shape = config.updates_per_step, config.batch_size
+        batch = replay.sample_steps(state.replay, key, shape, config.n_step, config.discount)
+    elif state.demonstrations is None:
         batch = replay.sample(state.replay, key, (config.updates_per_step, config.batch_size))
     else:
         key_own, key_demo = jax.random.split(key)

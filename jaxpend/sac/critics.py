@@ -23,12 +23,13 @@ class Critic(Protocol):
 
     def loss(
         self, params: Params, target: Params, batch: Transition, next_action: Array,
-        next_cost: Array, discount: float,
+        next_cost: Array, discount: Array | float,
     ) -> tuple[Array, Array]:  # fmt: skip
         """The loss () and the mean value () on a batch (n, ...).
 
         ``target`` are slowly following parameters, ``next_action`` (n,) is drawn by the actor
-        in the next state, ``next_cost`` (n,) the temperature times its log-probability.
+        in the next state, ``next_cost`` (n,) the temperature times its log-probability;
+        ``discount`` is of one step, or (n,) of all steps of a transition.
         """
 
 

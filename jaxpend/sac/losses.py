@@ -7,11 +7,14 @@ from jax import Array
 __all__ = ["actor", "imitation", "soft_target", "squared_error", "temperature_slope"]
 
 
-def soft_target(reward: Array, next_value: Array, next_cost: Array, discount: float) -> Array:
+def soft_target(
+    reward: Array, next_value: Array, next_cost: Array, discount: Array | float
+) -> Array:
     """What action values should be, (n,).
 
     ``next_value`` (n,) is of an action drawn in the next state, ``next_cost`` (n,) the temperature
-    times its log-probability. Episodes are truncated, never terminated: all bootstrap.
+    times its log-probability, ``discount`` () or (n,). Episodes are truncated, never terminated:
+    all bootstrap.
     """
     chex.assert_equal_shape((reward, next_value, next_cost))
     # y = r + gamma (Q'(s', a') - T log pi(a'|s'))

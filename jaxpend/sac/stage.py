@@ -1,20 +1,21 @@
-"""The stages of ``jaxpend sac``: imitation of demonstrations, and SAC itself."""
+"""The stages of ``jaxpend sac``: imitation of demonstrations, SAC itself, and several attempts."""
 
 from functools import partial
 from typing import Any, Self
 
 import jax
+import jax.numpy as jnp
 
 from ..boards import Task
 from ..config import Run, SACConfig
 from ..controller import Controller
 from ..pytree import Pytree, pytree
 from ..score import nominal
-from ..stage import Candidates, Chart, Row, Stage
+from ..stage import Candidates, Chart, Row, Stage, value
 from . import algorithm
 from .algorithm import Agent, SACState
 
-__all__ = ["SAC", "Imitation", "ImitationState", "chunk_length"]
+__all__ = ["SAC", "Attempts", "AttemptsState", "Imitation", "ImitationState", "chunk_length"]
 
 
 @pytree
@@ -84,7 +85,7 @@ def chunk_length(total: int, most: int) -> int:
 
 
 class SAC(Stage[SACState | None, SACState, Controller]):
-    """SAC on the surrogate reward; judged by the official score."""
+    """SAC on the surrogate reward; judged by ``stage.value``."""
 
     name, title, unit, column = "sac", "SAC", "environment steps", "env_steps"
     heading, scores = "after SAC", ("score",)
@@ -105,8 +106,10 @@ class SAC(Stage[SACState | None, SACState, Controller]):
         )
 
     @classmethod
-    def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
+    def of(cls, run: Run, start: Controller | None, task: Task) -> Stage | None:
         config = getattr(run, "sac", None)
+        if config and config.attempts > 1:
+            return Attempts(config, task)
         return cls(config, task) if config else None
 
     def start(self, seed: int, before: SACState | None) -> SACState:
@@ -135,8 +138,9 @@ class SAC(Stage[SACState | None, SACState, Controller]):
         policy = algorithm.greedy_policy(self.agent, state)
         c = nominal(policy, self.task)
         score = float(self.task.score(c))
+        worth = value(self.agent.config.objective, policy, score, self.task)
         row = {"updates": int(state.updates), "score": score, "uptime": c.uptime, **metrics}
-        return row, [(policy, score)]
+        return row | {"value": worth}, [(policy, worth)]
 
     def note(self, row: Row) -> str:
         return f"reward {float(row['reward']):.2f}  score {row['score']:.3f}"
@@ -146,3 +150,77 @@ class SAC(Stage[SACState | None, SACState, Controller]):
 
     def rekey(self, state: SACState, number: int) -> SACState:
         return state.replace(key=jax.random.fold_in(state.key, number))
+
+
+@pytree
+class AttemptsState(Pytree):
+    """An attempt under way, and the best policy of each."""
+
+    sac: SACState
+    number: jax.Array  # () int, of the attempt, from 0
+    policies: tuple[Controller, ...]
+    worths: jax.Array  # (attempts,) what they are compared by; -inf before an attempt
+
+
+class Attempts(Stage[SACState | None, AttemptsState, tuple[Controller, ...]]):
+    """SAC several times from scratch, each with a key of its own; all go on to the next stage."""
+
+    name, title, unit, column = SAC.name, SAC.title, SAC.unit, SAC.column
+    heading, scores, charts, ties = SAC.heading, SAC.scores, SAC.charts, SAC.ties
+
+    def __init__(self, config: SACConfig, task: Task):
+        self.inner, self.each = SAC(config, task), config.steps
+        self.agent, self.total = self.inner.agent, config.attempts * self.each
+
+    def start(self, seed: int, before: SACState | None) -> AttemptsState:
+        sac, count = self.inner.start(seed, before), self.agent.config.attempts
+        policies: tuple[Controller, ...] = (algorithm.greedy_policy(self.agent, sac),) * count
+        return AttemptsState(sac, jnp.asarray(0), policies, jnp.full(count, -jnp.inf))
+
+    def like(self) -> AttemptsState:
+        return jax.eval_shape(partial(self.start, 0, None))
+
+    def policy_like(self) -> Controller | None:
+        return self.inner.policy_like()
+
+    def done(self, state: AttemptsState) -> int:
+        return int(state.number) * self.each + min(self.inner.done(state.sac), self.each)
+
+    def _next(self, state: AttemptsState) -> AttemptsState:
+        """The same, or the next attempt where one is finished."""
+        if self.inner.done(state.sac) < self.each:
+            return state
+        sac = algorithm.begin(self.agent, jax.random.fold_in(state.sac.key, state.number))[0]
+        return state.replace(sac=sac, number=state.number + 1)
+
+    def advance(self, states: list[AttemptsState]) -> list[tuple[AttemptsState, Row]]:
+        states, after = [self._next(state) for state in states], []
+        moved = self.inner.advance([state.sac for state in states])
+        for state, (sac, metrics) in zip(states, moved, strict=True):
+            row, [(policy, worth)] = self.inner.judge(sac, metrics)
+            policies, number = list(state.policies), int(state.number)
+            if worth >= state.worths[number]:
+                policies[number] = policy
+                state = state.replace(worths=state.worths.at[number].set(worth))
+            row["attempt"] = number + 1
+            after.append((state.replace(sac=sac, policies=tuple(policies)), row))
+        return after
+
+    def judge(self, state: AttemptsState, metrics: Row) -> tuple[Row, Candidates]:
+        if not metrics:
+            return self.inner.judge(state.sac, metrics)
+        return metrics, [(algorithm.greedy_policy(self.agent, state.sac), metrics["value"])]
+
+    def note(self, row: Row) -> str:
+        return f"attempt {row['attempt']}  {self.inner.note(row)}"
+
+    def watched(self, state: AttemptsState) -> Any:
+        return self.inner.watched(state.sac)
+
+    def rekey(self, state: AttemptsState, number: int) -> AttemptsState:
+        return state.replace(sac=self.inner.rekey(state.sac, number))
+
+    def outcome(self, state: AttemptsState, best: Controller) -> tuple[Controller, ...]:
+        """The best policy of each attempt, the best of all first."""
+        order = sorted(range(len(state.policies)), key=lambda i: -float(state.worths[i]))
+        return tuple(state.policies[i] for i in order)
