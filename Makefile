@@ -1,7 +1,8 @@
-# `make` alone lists what there is. Variables: ROBOT, SEED, RUN (name of the run), ARGS.
+# `make` alone lists what there is. Variables: ROBOT, RECIPE, SEED, RUN (name of the run), ARGS.
 ROBOT ?= pendubot
+RECIPE ?= demonstrated
 SEED ?= 0
-RUN ?= $(ROBOT)-seed$(SEED)
+RUN ?= $(ROBOT)$(if $(filter demonstrated,$(RECIPE)),,-$(RECIPE))-seed$(SEED)
 ARGS ?=
 PYTHON ?= python3
 VENV := .venv
@@ -12,13 +13,19 @@ ifeq ($(filter $(ROBOT),acrobot pendubot),)
 $(error ROBOT is '$(ROBOT)'; it must be acrobot or pendubot)
 endif
 
+# What `make train` reads: a recipe that ships with the package.
+CONFIG = $(or $(CONFIG_$(RECIPE)),$(error RECIPE is '$(RECIPE)'; it must be demonstrated, learned or plain))
+CONFIG_demonstrated := $(ROBOT)
+CONFIG_learned := learned_$(ROBOT)
+CONFIG_plain := plain
+
 .DEFAULT_GOAL := help
 .PHONY: help install train snes score robustness leaderboard runs report docs test lint bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 	@echo
-	@echo "variables: ROBOT=acrobot|pendubot  SEED=0  RUN=name  ARGS='--sac.steps 100000'"
+	@echo "variables: ROBOT=acrobot|pendubot  RECIPE=demonstrated|learned|plain  SEED=0  RUN=name  ARGS='--sac.steps 100000'"
 	@echo "the command behind them, with its own --help: $(BIN)/jaxpend"
 
 $(STAMP): pyproject.toml .constraints.txt
@@ -30,8 +37,8 @@ $(STAMP): pyproject.toml .constraints.txt
 
 install: $(STAMP)  ## make .venv with pinned versions
 
-train: $(STAMP)  ## imitation, SAC and SNES by the recipe of ROBOT; ends with the official score
-	$(BIN)/jaxpend train --config $(ROBOT) --seed $(SEED) --run $(RUN) $(ARGS)
+train: $(STAMP)  ## train by a recipe, RECIPE=demonstrated|learned|plain; ends with the official score
+	$(BIN)/jaxpend train --config $(CONFIG) --robot $(ROBOT) --seed $(SEED) --run $(RUN) $(ARGS)
 
 snes: $(STAMP)  ## fine-tune by SNES: ARGS='--policy FILE' or '--controller NAME'
 	$(BIN)/jaxpend snes --robot $(ROBOT) --seed $(SEED) $(ARGS)
@@ -55,7 +62,7 @@ docs: $(STAMP)  ## the reference: build/docs/index.html, from the docstrings
 	$(BIN)/python experiments/reference.py $(ARGS)
 
 test: $(STAMP)  ## the test suite
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: $(STAMP)  ## ruff: rules and format; mypy: types
 	$(BIN)/ruff check .

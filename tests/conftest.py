@@ -33,8 +33,22 @@ both_robots = pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
 
 
 # Most of the suite's time is compilation. XLA's older emitters without LLVM's optimisations take a
-# third of it, and what they compile runs half as fast.
-XLA = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+# third of it, and what they compile runs half as fast. All cores are busy, so that splitting a
+# program for several threads would only cost.
+XLA = (
+    "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 "
+    "--xla_cpu_parallel_codegen_split_count=1"
+)
+# These files take longest, and a file is one worker's: begun first, none of them is waited for.
+LONG = (
+    "test_resume", "test_hostile", "test_cli", "test_controllers", "test_stages", "test_guard",
+    "test_gradient", "test_snes", "test_train", "test_tutorial", "test_leaderboard", "test_export",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items):
+    order = {name: place for place, name in enumerate(LONG)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(LONG)))
 
 
 def pytest_configure(config):

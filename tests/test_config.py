@@ -276,9 +276,10 @@ def test_sections_of_other_commands_are_passed_over_only_where_said(tmp_path):
 
 
 def test_the_recipes_are_valid_for_every_training_command():
-    assert recipes() == ["acrobot", "pendubot", "plain"]
+    names = ["acrobot", "learned_acrobot", "learned_pendubot", "pendubot", "plain"]
+    assert recipes() == names
     for name, kind in itertools.product(recipes(), (SACRun, SNESRun, TrainRun)):
         run = load_config(kind(), name, SECTIONS)
-        assert run.robot == (name if name != "plain" else "pendubot")
+        assert run.robot == (name.removeprefix("learned_") if name != "plain" else "pendubot")
         if kind is not SACRun:
             assert run.snes == load_config(TrainRun(), name, SECTIONS).snes
