@@ -8,6 +8,7 @@ and action. See ``sac.networks.Actor`` for why the policy does not see it.
 """
 
 import dataclasses
+from typing import TypeVar
 
 import chex
 import jax
@@ -21,7 +22,9 @@ from .rollout import actuate, draws, measure
 from .scenario import DT, Scenario
 from .variations import LONGEST_DELAY, sample
 
-__all__ = ["Env", "EnvConfig", "EnvState", "Reward", "World", "surrogate_reward"]
+__all__ = ["Env", "EnvConfig", "EnvState", "Reward", "World", "restarted", "surrogate_reward"]
+
+T = TypeVar("T")
 
 START_SPEED = 5.0  # rad/s, standard deviation of velocities of an episode that starts anywhere
 
@@ -75,7 +78,7 @@ class Env:
     """Acrobot or pendubot as a task for a learner; hashable, so static in jit.
 
     ``reset`` and ``step`` are pure and of one environment; ``jax.vmap`` them. Episodes never
-    terminate: count steps, time limits truncate.
+    terminate: count steps, and ask ``truncated``.
     """
 
     config: EnvConfig
@@ -155,6 +158,14 @@ class Env:
         reward = surrogate_reward(self.plant, self.config.reward, self.line, x, a, state.action)
         return self.observe(x, a, past, world, reward)
 
+    def truncated(self, state: EnvState, steps: jax.Array) -> jax.Array:
+        """Whether an episode is cut off in this state, after so many steps (...): bool (...).
+
+        It is at the time limit and beyond ``max_speed``.
+        """
+        speed = jnp.abs(state.x[..., 2:]).max(axis=-1)
+        return (steps >= self.config.episode_steps) | (speed > self.config.max_speed)
+
     def kicked(self, state: EnvState, change: jax.Array) -> EnvState:
         """The same with ``change`` (4,) added to the true state; in a scenario measured later."""
         return self.observe(state.x + change, state.action, state.past, state.world, state.reward)
@@ -181,3 +192,12 @@ class Env:
         view = self.config.observation
         true = dataclasses.replace(view, history=0).mirrored if self.config.randomised else ()
         return view.mirrored, (*true, -1)
+
+
+def restarted(over: jax.Array, fresh: T, now: T) -> T:
+    """The pytree ``fresh`` where an episode is over (n,), elsewhere ``now``; leaves (n, ...)."""
+
+    def restart(new, old):
+        return jnp.where(over.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
+
+    return jax.tree.map(restart, fresh, now)

@@ -31,6 +31,7 @@ runs
 train
 interop
 report
+interop.gymnasium
 cli
 """
 RANK = {name: rank for rank, line in enumerate(LAYERS.split("\n")) for name in line.split()}

@@ -12,7 +12,7 @@ from ..files import write_atomically
 from .figures import PALETTE
 from .judged import Judged
 
-__all__ = ["gif", "keyframes"]
+__all__ = ["frame", "gif", "keyframes"]
 
 EVERY = 5  # of the 500 Hz samples the page plays one in five
 # Of the GIF.
@@ -36,8 +36,16 @@ def keyframes(judged: Judged) -> dict[str, Any]:
     }
 
 
-def _frame(points, trail, reach: float, height: float, time: float) -> Image.Image:
-    """One picture, drawn twice as large and scaled down, which smooths its edges."""
+def frame(points, trail, reach: float, height: float, time: float) -> Image.Image:
+    """One picture, drawn twice as large and scaled down, which smooths its edges.
+
+    Args:
+        points: (2, 2) m, elbow and end effector, x and y.
+        trail: (n, 2) m, where the end effector has been; may be empty.
+        reach: m, what the end effector reaches when it is stretched.
+        height: of the line, as a fraction of it.
+        time: s.
+    """
     big = 2 * SIZE
     image = Image.new("RGB", (big, big), PALETTE["paper"])
     draw = ImageDraw.Draw(image)
@@ -73,7 +81,7 @@ def gif(path: Path, judged: Judged) -> None:
     picked = np.round(np.arange(0, judged.window, 1 / RATE) / step).astype(int)
     back = round(TRAIL / step)
     images = [
-        _frame(points[k], points[max(k - back, 0) : k + 1 : 5, 1], judged.reach, height, t[k])
+        frame(points[k], points[max(k - back, 0) : k + 1 : 5, 1], judged.reach, height, t[k])
         for k in picked[picked < len(t)]
     ]
     # One palette of all the colours there are, from pictures with and without each of them.

@@ -15,7 +15,7 @@ import optax
 from ..boards import Task
 from ..config import SACConfig
 from ..controllers.policy import Policy
-from ..env import Env, EnvState
+from ..env import Env, EnvState, restarted
 from ..pytree import Pytree, pytree
 from . import losses, replay
 from .critics import Critic, TwinCritic
@@ -238,16 +238,11 @@ def interact(agent: Agent, state: SACState, key: jax.Array) -> tuple[SACState, j
     action = jnp.where(state.env_steps < config.warmup_steps, uniform, action)
     after = jax.vmap(env.step)(before, action)
     now = Transition.between(before, action, after, config.reward_scale)
-    truncated = state.env_time + 1 >= config.env.episode_steps
-    truncated |= jnp.abs(after.x[:, 2:]).max(axis=1) > config.env.max_speed
+    truncated = env.truncated(after, state.env_time + 1)
     fresh = jax.vmap(env.reset)(jax.random.split(key_reset, config.num_envs))
-
-    def restart(new, old):
-        return jnp.where(truncated.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
-
     state = state.replace(
         replay=replay.add(state.replay, now, truncated),
-        envs=jax.tree.map(restart, fresh, after),
+        envs=restarted(truncated, fresh, after),
         env_time=jnp.where(truncated, 0, state.env_time + 1),
         env_steps=state.env_steps + config.num_envs,
     )
