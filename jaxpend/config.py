@@ -156,6 +156,9 @@ class SACConfig(Checked):
         if self.replay_capacity < self.num_envs:
             text = f"it must hold at least one step of all {self.num_envs} environments"
             raise JaxpendError(f"replay_capacity is {self.replay_capacity}; {text}")
+        if self.mirror and not self.env.observation.symmetric:
+            text = "mirror is on, but the mean of the observation is not the same left and right"
+            raise JaxpendError(f"{text}; turn mirror off")
         shown = self.demonstrations
         if shown.episodes and self.batch_size < 2:
             raise JaxpendError("batch_size is 1; it must be at least 2, half are demonstrations")
