@@ -25,7 +25,15 @@ from ..observation import Observation
 from ..robots import ROBOTS
 from .tensors import MOST_PICKLE, MOST_TENSORS, Name, StateDict, array, description, member
 
-__all__ = ["PRESETS", "Convention", "Model", "declared", "read_model", "read_statistics"]
+__all__ = [
+    "PRESETS",
+    "Convention",
+    "Model",
+    "Statistics",
+    "declared",
+    "read_model",
+    "read_statistics",
+]
 
 # What an environment may show: a kind of ``Observation``, and where each of its entries is there.
 SEEN: dict[str, tuple[str, tuple[int, ...] | None]] = {
@@ -115,6 +123,7 @@ def read_model(path: str | Path, robot: str, convention: Convention) -> Model:
             that has no place there, or an observation or activation that does not fit.
     """
     choose("robot", robot, ROBOTS)
+    statistics = convention.statistics and read_statistics(convention.statistics)
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
@@ -127,6 +136,7 @@ def read_model(path: str | Path, robot: str, convention: Convention) -> Model:
                 version = member(archive, "_stable_baselines3_version", 64).decode().strip()
         algorithm = _algorithm(state)
         policy = _policy(options, _layers(state, algorithm), algorithm, robot, convention)
+        policy = _normalised(policy, convention, statistics) if statistics else policy
     except FileNotFoundError:
         raise JaxpendError(f"there is no model {path}") from None
     except JaxpendError as error:
@@ -192,11 +202,6 @@ def _policy(
     if squash == "clip":  # at the ends of the action space; the others scale to it afterwards
         bound = _bound(options)
         layers[-1] = last / bound, last_bias / bound
-    if convention.statistics is not None:
-        mean, std, clip = read_statistics(convention.statistics)
-        if order is not None and len(mean) == len(std) == len(order):
-            mean, std = mean[list(order)], std[list(order)]
-        view = dataclasses.replace(view, mean=mean.tolist(), std=std.tolist(), clip=clip)
     if order is not None:
         layers[0] = layers[0][0][list(order)], bias
     return Policy(
@@ -207,6 +212,16 @@ def _policy(
         activation=_activation(keywords, algorithm, convention),
         squash=squash,
     )
+
+
+def _normalised(policy: Policy, convention: Convention, statistics: "Statistics") -> Policy:
+    """The same of an observation that is normalised by statistics in the order of the zip."""
+    mean, std, clip = statistics
+    order = SEEN[convention.observation][1]
+    if order is not None and len(mean) == len(order):
+        mean, std = mean[list(order)], std[list(order)]
+    view = dataclasses.replace(policy.observation, mean=mean.tolist(), std=std.tolist(), clip=clip)
+    return policy.replace(observation=view)
 
 
 def _activation(keywords: dict[str, Any], algorithm: str, convention: Convention) -> str:
@@ -252,8 +267,16 @@ def _bound(options: dict[str, Any]) -> float:
 LIBRARIES = ("stable_baselines3", "gymnasium", "gym", "numpy", "collections")
 
 
-def read_statistics(path: str | Path) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """Mean and standard deviation (n,) of observations, and where they are then clipped.
+class Statistics(NamedTuple):
+    """Of the observations of a run."""
+
+    mean: np.ndarray  # (n,)
+    std: np.ndarray  # (n,)
+    clip: float | None  # largest magnitude of what is normalised
+
+
+def read_statistics(path: str | Path) -> Statistics:
+    """The running statistics that observations were normalised by.
 
     Args:
         path: what ``VecNormalize.save`` wrote, which is not unpickled but read as ``tensors``
@@ -279,7 +302,7 @@ def read_statistics(path: str | Path) -> tuple[np.ndarray, np.ndarray, float | N
     except Exception:  # whatever zipfile and numpy raise for bytes that are not theirs
         text = f"{path} holds no running statistics of observations, or it is cut off or damaged"
         raise JaxpendError(f"{text}; a VecNormalize or a .npz of mean and var is read") from None
-    return mean, np.sqrt(var + epsilon), clip if math.isfinite(clip) else None
+    return Statistics(mean, np.sqrt(var + epsilon), clip if math.isfinite(clip) else None)
 
 
 def _vec_normalize(content: bytes) -> dict[str, np.ndarray]:
