@@ -26,6 +26,7 @@ from .observation import Observation
 
 __all__ = [
     "LINES",
+    "Activation",
     "CheckpointConfig",
     "DemonstrationConfig",
     "EnvConfig",

@@ -1,6 +1,7 @@
 """The door for models of Stable-Baselines3: what a policy computes, and what a file may not do."""
 
 import base64
+import dataclasses
 import io
 import itertools
 import os
@@ -18,6 +19,7 @@ from conftest import assert_close
 from sb3_files import RELU, TANH, name, network, options, state_dict, text
 
 from jaxpend import cli, load_policy
+from jaxpend.boards import v2
 from jaxpend.controllers.files import read_header
 from jaxpend.designs import active_joint
 from jaxpend.interop.stable_baselines3 import (
@@ -27,6 +29,7 @@ from jaxpend.interop.stable_baselines3 import (
     read_model,
 )
 from jaxpend.interop.tensors import StateDict
+from jaxpend.snes import SNESConfig, best_controller, evolve, init
 
 STATES = np.random.default_rng(1).normal(size=(50, 4)) * [4, 4, 30, 30]
 MEAN, VAR = np.array([0.1, -0.2, 0.3, 0.0]), np.array([0.5, 2.0, 0.01, 0.3])
@@ -75,7 +78,8 @@ def test_sac_acts_as_its_authors_code(tmp_path, robot):
     layers = layers_of(4, 8, 8, 1)
     path = sb3_files.model(tmp_path / "m.zip", network(layers, "SAC"))
     found = read_model(path, robot, EVOLSAC)
-    assert (found.algorithm, found.version, found.policy.robot) == ("SAC", "2.3.2", robot)
+    assert (found.algorithm, found.library) == ("SAC", "Stable-Baselines3 2.3.2")
+    assert found.policy.robot == robot
     wanted = [3 * np.tanh(mean_action(layers, "relu", wrapped(x, 50))) for x in STATES]
     assert_close(torques(found.policy, active_joint(robot)), wanted)
 
@@ -157,6 +161,21 @@ def test_cosine_and_sine_by_joint(tmp_path):
     assert_close(torques(read_model(path, "pendubot", convention).policy, 0), wanted)
 
 
+def test_a_policy_that_was_read_can_be_trained_further(tmp_path):
+    """Also where it sees normalised observations and its actions are clipped: not only a number."""
+    path = sb3_files.model(tmp_path / "m.zip", network(layers_of(4, 3, 1), "PPO"))
+    np.savez(tmp_path / "s.npz", mean=MEAN, var=VAR)
+    convention = Convention("wrapped", 20.0, 3.0, str(tmp_path / "s.npz"))
+    policy = read_model(path, "pendubot", convention).policy
+    task = dataclasses.replace(v2("pendubot").task, duration=0.2)
+    config = SNESConfig(population=4, action_noise=0.3)
+    state, metrics = evolve(config, policy, init(config, policy, jax.random.key(0)), 2, task)
+    best = best_controller(config, policy, state)
+    assert best.observation == policy.observation
+    assert np.isfinite(metrics["max_fitness"]).all()
+    assert not np.array_equal(best.layers[0][0], policy.layers[0][0])
+
+
 def test_tensors_in_any_layout_are_read():
     rng = np.random.default_rng(0)
     weight = rng.normal(size=(3, 2))
@@ -204,7 +223,7 @@ def test_the_command_writes_a_file_that_others_take(here, monkeypatch, capsys):
     assert jax.tree.structure(policy) == jax.tree.structure(wanted)
     said = read_header("policy.npz")["provenance"]
     assert said == {"command": f"jaxpend {' '.join(LINE)}", "algorithm": "SAC",
-                    "stable_baselines3": "2.3.2"}  # fmt: skip
+                    "library": "Stable-Baselines3 2.3.2"}  # fmt: skip
     assert run(monkeypatch, capsys, *LINE)[0] == 0  # its own file it writes again
 
 

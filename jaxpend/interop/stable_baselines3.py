@@ -105,7 +105,7 @@ class Model(NamedTuple):
 
     policy: Policy
     algorithm: str  # "SAC" or "PPO"
-    version: str  # of Stable-Baselines3
+    library: str  # "Stable-Baselines3" and its version
 
 
 def read_model(path: str | Path, robot: str, convention: Convention) -> Model:
@@ -131,9 +131,9 @@ def read_model(path: str | Path, robot: str, convention: Convention) -> Model:
                 raise JaxpendError("it is a zip, but no model that Stable-Baselines3 has saved")
             options = json.loads(member(archive, "data", MOST_OPTIONS))
             state = StateDict(member(archive, "policy.pth", MOST_TENSORS))
-            version = ""
+            library = "Stable-Baselines3"
             if "_stable_baselines3_version" in names:
-                version = member(archive, "_stable_baselines3_version", 64).decode().strip()
+                library += f" {member(archive, '_stable_baselines3_version', 64).decode().strip()}"
         algorithm = _algorithm(state)
         policy = _policy(options, _layers(state, algorithm), algorithm, robot, convention)
         policy = _normalised(policy, convention, statistics) if statistics else policy
@@ -144,7 +144,7 @@ def read_model(path: str | Path, robot: str, convention: Convention) -> Model:
     except Exception:  # zipfile, json and numpy raise a dozen kinds for bytes that are not theirs
         text = f"{path} is not a model of Stable-Baselines3, or it is empty, cut off or damaged"
         raise JaxpendError(text) from None
-    return Model(policy, algorithm, version)
+    return Model(policy, algorithm, library)
 
 
 def _algorithm(state: StateDict) -> str:

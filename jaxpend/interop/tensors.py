@@ -18,7 +18,9 @@ import numpy as np
 
 from ..errors import JaxpendError
 
-__all__ = ["Call", "Name", "StateDict", "array", "description", "member"]
+__all__ = [
+    "MOST_PICKLE", "MOST_TENSORS", "Call", "Name", "StateDict", "array", "description", "member",
+]  # fmt: skip
 
 MOST_PICKLE = 2**20  # bytes of a pickle that is described; those of real models have some 5 kB
 MOST_TENSORS = 2**27  # bytes of a file of tensors; those of the published models have 1.4 MB
