@@ -264,9 +264,8 @@ def bomb():
     return file.getvalue()
 
 
-def clash():
-    """A pickle that takes for ever to unpickle: its key is a tuple of 2 to the 60 empty ones."""
-    return b"}" + b")" + b"2\x86" * 60 + b"K\x01s"
+# A tuple of two tuples of two tuples ...: it would take for ever to write, compare or hash it.
+ENDLESS = b")" + b"q\x07h\x07\x86" * 60
 
 
 DAMAGED = "model.zip is not a model of Stable-Baselines3, or it is empty, cut off or damaged\n"
@@ -277,7 +276,7 @@ BAD = {
     "another algorithm": ({"tensors": {"actor.mu.0.weight": np.ones((1, 4), "f4")}}, LAYERS),
     "no layers": ({"tensors": {}}, "its layers are none, ..."),
     "recurrent": ({"tensors": PPO | {"lstm_actor.bias": np.ones(3, "f4")}},
-                  "it has a layer lstm_actor.bias, which plain PPO does not have"),
+                  "it has a layer lstm_actor.bias, which plain PPO does not"),
     "extractor": (with_tensors(actor__features_extractor__cnn=np.ones(3, "f4")),
                   "it has a layer actor.features_extractor.cnn, which plain SAC does not"),
     "extractor without weights": (
@@ -294,6 +293,8 @@ BAD = {
     "not finite": (with_tensors(actor__mu__bias=np.array([np.nan], "f4")), "actor.mu holds values"),
     "observation": ({"tensors": network(layers_of(6, 8, 1), "SAC")},
                     "its network sees 6 numbers, 'wrapped' is 4; declare the observation"),
+    "dictionary": ({"tensors": PPO, "observation_space": {":type:": "<class 'x.dict.Dict'>"}},
+                   "its observation is not one vector of numbers, a Box"),
     "actions": ({"tensors": network(layers_of(4, 8, 2), "SAC")}, "it has 2 actions; one is read"),
     "activation": ({"tensors": network(layers_of(4, 8, 1), "SAC"), "policy_kwargs": {
         "activation_fn": "<class 'torch.nn.modules.activation.ELU'>"}}, "its activation is ELU;"),
@@ -312,7 +313,10 @@ BAD = {
     "nothing": (with_pickle(b"0"), DAMAGED),
     "list": (with_pickle(b"]"), "its layers are none"),
     "number": (with_pickle(b"K\x01"), DAMAGED),
-    "endless": (with_pickle(clash()), DAMAGED),
+    "endless key": (with_pickle(b"}" + ENDLESS + b"K\x01s"), DAMAGED),
+    "endless name": (with_pickle(ENDLESS + text("x") + b"\x93"), DAMAGED),
+    "endless call": (with_pickle(ENDLESS + b")R"), DAMAGED),
+    "endless axes": (with_odd(shape=(1,) * 1000, strides=(1,) * 1000), DAMAGED),
     "too far": (with_odd(offset=1), DAMAGED),
     "out of nothing": (with_odd(shape=(2**20, 2**20), strides=(0, 0)), DAMAGED),
     "backwards": (with_odd(shape=(2, 2), strides=(-1, -1)), DAMAGED),

@@ -1,9 +1,10 @@
 """Policies that Stable-Baselines3 has trained, as policies of this package; torch is not needed.
 
-``model.save`` of SAC or PPO writes a zip: ``policy.pth`` has the tensors, ``data`` the options as
-JSON, in which what JSON cannot hold is pickled. Only tensors and plain JSON are read; see
-``tensors`` for why no pickle in it can do anything. The zip does not say what its environment
-showed the policy, nor its torque: that has to be declared, a ``Convention``.
+``model.save`` of SAC or PPO (or of A2C, which acts as PPO does and is taken for it) writes a zip:
+``policy.pth`` has the tensors, ``data`` the options as JSON, in which what JSON cannot hold is
+pickled. Only tensors and plain JSON are read; see ``tensors`` for why no pickle in it can do
+anything. The zip does not say what its environment showed the policy, nor its torque: that has to
+be declared, a ``Convention``.
 """
 
 import dataclasses
@@ -23,7 +24,7 @@ from ..errors import JaxpendError, choose
 from ..fields import Checked, Positive
 from ..observation import Observation
 from ..robots import ROBOTS
-from .tensors import MOST_PICKLE, MOST_TENSORS, Name, StateDict, array, description, member
+from .tensors import MOST_PICKLE, MOST_TENSORS, Name, StateDict, array, description, member, shown
 
 __all__ = [
     "PRESETS",
@@ -154,8 +155,8 @@ def _algorithm(state: StateDict) -> str:
             others = [layer for layer in state if not re.match(known, layer)]
             if not others:
                 return name
-            raise JaxpendError(f"it has a layer {others[0]}, which plain {name} does not have")
-    found = ", ".join(list(dict.fromkeys(name.rpartition(".")[0] for name in state))[:3])
+            raise JaxpendError(f"it has a layer {shown(others[0])}, which plain {name} does not")
+    found = ", ".join(list(dict.fromkeys(shown(name.rpartition(".")[0]) for name in state))[:3])
     ours = " or ".join(f"{name} ({first}, {last})" for name, (first, last, _) in ACTORS.items())
     raise JaxpendError(f"its layers are {found or 'none'}, ...; those of {ours} can be read")
 
@@ -187,6 +188,9 @@ def _policy(
     robot: str,
     convention: Convention,
 ) -> Policy:
+    seen = options.get("observation_space", {})
+    if ".Box" not in str(seen.get(":type:", ".Box")):
+        raise JaxpendError("its observation is not one vector of numbers, a Box")
     keywords = options.get("policy_kwargs") or {}
     kind, order = SEEN[convention.observation]
     view = Observation(kind, convention.max_velocity)  # type: ignore[arg-type]
@@ -233,7 +237,7 @@ def _activation(keywords: dict[str, Any], algorithm: str, convention: Convention
         return DEFAULT_ACTIVATION[algorithm]
     name = str(said).rstrip("'>").rpartition(".")[2]
     if name not in ACTIVATION_OF:
-        raise JaxpendError(f"its activation is {name}; known: {', '.join(ACTIVATION_OF)}")
+        raise JaxpendError(f"its activation is {shown(name)}; known: {', '.join(ACTIVATION_OF)}")
     return ACTIVATION_OF[name]
 
 
@@ -249,7 +253,7 @@ def _squash(
         return convention.squash
     module = str((options.get("policy_class") or {}).get("__module__", ""))
     if not module.startswith("stable_baselines3."):
-        text = f"its policy is of a class of {module or 'unknown origin'}"
+        text = f"its policy is of a class of {shown(module) or 'unknown origin'}"
         raise JaxpendError(f"{text}; declare whether that squashes actions by tanh or clip")
     return "tanh" if keywords.get("squash_output") is True else "clip"
 

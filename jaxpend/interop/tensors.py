@@ -20,9 +20,11 @@ from ..errors import JaxpendError
 
 __all__ = [
     "MOST_PICKLE", "MOST_TENSORS", "Call", "Name", "StateDict", "array", "description", "member",
+    "shown",
 ]  # fmt: skip
 
 MOST_PICKLE = 2**20  # bytes of a pickle that is described; those of real models have some 5 kB
+MOST_AXES = 8  # of a tensor
 MOST_TENSORS = 2**27  # bytes of a file of tensors; those of the published models have 1.4 MB
 
 
@@ -34,6 +36,11 @@ class Name(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.module}.{self.name}"
+
+
+def shown(text: Any) -> str:
+    """Text of a file as it may stand in a sentence: not long, and in one line."""
+    return repr(str(text)[:80])[1:-1]
 
 
 @dataclasses.dataclass(eq=False)
@@ -80,9 +87,13 @@ class _Reader:
 
     def named(self, module: Any, name: Any) -> Name:
         """A name, if it is an expected one."""
+        if not (isinstance(module, str) and isinstance(name, str)):
+            raise ValueError("no name")
         found = Name(module, name)
         if not self.expected(found):
-            raise JaxpendError(f"it names {found!s}, which has no place in it; nothing was run")
+            raise JaxpendError(
+                f"it names {shown(found)}, which has no place in it; nothing was run"
+            )
         return found
 
     def build(self, state: Any) -> None:
@@ -251,18 +262,19 @@ class StateDict:
             raise ValueError("no tensor")
         storage, offset, shape, strides = tensor.arguments[:4]
         said, kind, key, _, count = storage.arguments
-        if storage.function != PERSISTENT or said != "storage" or kind.name not in STORAGES:
-            raise JaxpendError(f"{name} is of {kind.name}; floating-point numbers are read")
+        numbers = [offset, count, *shape, *strides]
+        whole = all(type(n) is int and 0 <= n <= MOST_TENSORS for n in numbers)
+        # What is text must be, since other things that a pickle holds can be too long to write.
+        if not (whole and said == "storage" and isinstance(key, str) and len(shape) <= MOST_AXES):
+            raise ValueError("storage")
+        if kind.name not in STORAGES:
+            raise JaxpendError(f"{name} is of {shown(kind.name)}; floating-point numbers are read")
         dtype = np.dtype(self.order + STORAGES[kind.name])
         content = member(self.archive, f"{self.folder}/data/{key}", MOST_TENSORS)
-        numbers = [offset, count, *shape, *strides]
-        if not all(type(n) is int and 0 <= n <= MOST_TENSORS for n in numbers):
-            raise ValueError("shape")
         last = offset + sum((n - 1) * step for n, step in zip(shape, strides, strict=True))
         # A view may not have more numbers than there are, nor reach beyond them.
-        if len(content) != count * dtype.itemsize or 0 in shape or math.prod(shape) > count:
-            raise ValueError("shape")
-        if last >= count:
+        few = 0 not in shape and math.prod(shape) <= count and last < count
+        if not (few and len(content) == count * dtype.itemsize):
             raise ValueError("shape")
         flat = np.frombuffer(content, dtype)[offset:]
         steps = [step * dtype.itemsize for step in strides]
