@@ -26,6 +26,7 @@ from .observation import Observation
 
 __all__ = [
     "LINES",
+    "Activation",
     "CheckpointConfig",
     "DemonstrationConfig",
     "EnvConfig",
@@ -182,6 +183,9 @@ class SACConfig(Checked):
         for name in ("n_step", "attempts"):
             if (number := getattr(self, name)) > 1 and self.demonstrations.episodes:
                 raise JaxpendError(f"{name} is {number}; with demonstrations it must be 1")
+        if self.mirror and not self.env.observation.symmetric:
+            text = "mirror is on, but the mean of the observation is not the same left and right"
+            raise JaxpendError(f"{text}; turn mirror off")
         shown = self.demonstrations
         if shown.episodes and self.batch_size < 2:
             raise JaxpendError("batch_size is 1; it must be at least 2, half are demonstrations")

@@ -133,14 +133,14 @@ def retained(config: GradientConfig, policy: Policy, task: Task) -> Retained:
 
     obs, counts = jax.vmap(one)(scenarios, jax.random.split(key_runs, SHOWN))
     obs = obs.reshape(-1, obs.shape[-1])
-    return Retained(obs, jnp.tanh(jax.vmap(policy.pre_action)(obs)), counts.ravel().astype("f4"))
+    return Retained(obs, jax.vmap(policy.greedy)(obs), counts.ravel().astype("f4"))
 
 
 def change(policy: Policy, kept: Retained, key: jax.Array) -> jax.Array:
     """Mean squared distance () of a policy's actions to some of those that are retained."""
     some = jax.random.randint(key, (DRAWN,), 0, len(kept.action))
     kept = jax.tree.map(lambda leaf: leaf[some], kept)
-    off = jnp.tanh(jax.vmap(policy.pre_action)(kept.obs)) - kept.action
+    off = jax.vmap(policy.greedy)(kept.obs) - kept.action
     return jnp.sum(kept.counts * off**2) / jnp.maximum(kept.counts.sum(), 1)
 
 

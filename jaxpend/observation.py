@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Literal
 
+from .errors import JaxpendError
 from .fields import Checked, Natural, Positive
 
 if TYPE_CHECKING:
@@ -32,21 +33,55 @@ def _sincos(x: jax.Array, max_velocity: float) -> jax.Array:
     return jnp.concatenate([jnp.cos(angles), jnp.sin(angles), velocity / max_velocity])
 
 
+def _clipped(x: jax.Array, max_velocity: float) -> jax.Array:
+    """The same with velocities clipped to [-1, 1]."""
+    import jax.numpy as jnp
+
+    seen = _sincos(x, max_velocity)
+    return jnp.concatenate([seen[:4], jnp.clip(seen[4:], -1.0, 1.0)])
+
+
+def _state(x: jax.Array, max_velocity: float) -> jax.Array:
+    """Angles as they are, however many turns, in rad, and scaled velocities."""
+    import jax.numpy as jnp
+
+    return jnp.concatenate([x[:2], x[2:4] / max_velocity])
+
+
 # Name -> function, and the sign of each entry when left and right change places.
-KINDS = {"wrapped": (_wrapped, (-1,) * 4), "sincos": (_sincos, (1, 1, -1, -1, -1, -1))}
+KINDS = {
+    "wrapped": (_wrapped, (-1,) * 4),
+    "sincos": (_sincos, (1, 1, -1, -1, -1, -1)),
+    "sincos_clipped": (_clipped, (1, 1, -1, -1, -1, -1)),
+    "state": (_state, (-1,) * 4),
+}
 
 
 @dataclasses.dataclass(frozen=True)
 class Observation(Checked):
     """How a state (4,), and what came before it, become an observation (``size``,).
 
-    Raises ``JaxpendError`` for an unknown kind, a velocity scale that is not positive, or a
-    negative history.
+    What is seen of a state (``state_size``,) is normalised to ``(seen - mean) / std``, then
+    clipped to ``[-clip, clip]``; each of the three may be left out.
+
+    Raises ``JaxpendError`` for an unknown kind, a velocity scale that is not positive, a
+    negative history, or a mean or std that is not of ``state_size``.
     """
 
-    kind: Literal["wrapped", "sincos"] = "sincos"
+    kind: Literal["wrapped", "sincos", "sincos_clipped", "state"] = "sincos"
     max_velocity: Positive = 20.0  # rad/s, velocities are divided by it
     history: Natural = 0  # past states and actions that are seen too, one control period apart
+    mean: tuple[float, ...] | None = None  # of what is seen of a state; None: 0
+    std: tuple[Positive, ...] | None = None  # standard deviations; None: 1
+    clip: Positive | None = None  # largest magnitude of what is seen, once normalised; None: any
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("mean", "std"):
+            value = getattr(self, name)
+            if value is not None and len(value) != self.state_size:
+                text = f"{name} is {value}; it must be {self.state_size} values, as many as "
+                raise JaxpendError(f"{text}{self.kind!r} sees of a state")
 
     @property
     def size(self) -> int:
@@ -60,13 +95,29 @@ class Observation(Checked):
 
     @property
     def mirrored(self) -> tuple[int, ...]:
-        """The factors (``size``,), 1 or -1, that make it the observation of the mirrored state."""
+        """The factors (``size``,), 1 or -1, that make it the observation of the mirrored state.
+
+        They do so only where it is ``symmetric``.
+        """
         signs = KINDS[self.kind][1]
         return signs + (*signs, -1) * self.history
 
+    @property
+    def symmetric(self) -> bool:
+        """Whether left and right look alike: the mean is 0 where a mirror changes the sign."""
+        signs = KINDS[self.kind][1]
+        return all(s > 0 or not m for s, m in zip(signs, self.mean or (), strict=False))
+
     def of_state(self, x: jax.Array) -> jax.Array:
         """What is seen of a state (4,): (``state_size``,)."""
-        return KINDS[self.kind][0](x, self.max_velocity)
+        import jax.numpy as jnp
+
+        seen = KINDS[self.kind][0](x, self.max_velocity)
+        if self.mean is not None:
+            seen = seen - jnp.array(self.mean, seen.dtype)
+        if self.std is not None:
+            seen = seen / jnp.array(self.std, seen.dtype)
+        return seen if self.clip is None else jnp.clip(seen, -self.clip, self.clip)
 
     def __call__(self, x: jax.Array, past: jax.Array | None = None) -> jax.Array:
         """Observation of a state (4,) and of ``past`` (history, 5), if there is any history.

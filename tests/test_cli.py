@@ -247,7 +247,7 @@ def test_help_has_an_example_that_parses(monkeypatch, capsys, name):
     example = cli.COMMANDS[name].example
     assert (code, err) == (0, "")
     assert f"example: jaxpend {name} {example}" in " ".join(out.split())
-    function = getattr(commands, name)
+    function = cli.function_of(name)
     call = cli.parse(function, "prog", example.split())
     assert call.func is function
     assert call.args or call.keywords

@@ -108,6 +108,15 @@ def test_every_text_is_free_or_one_of_a_few():
         (lambda: EnvConfig(randomised=1.5), "randomised is 1.5; it must be at most 1"),
         (lambda: EnvConfig(upright_starts=-0.1), "it must not be negative"),
         (lambda: Reward(floor=math.inf), "floor is inf; it must be at most 0"),
+        (
+            lambda: SACConfig(mirror=True, env=EnvConfig(observation=Observation(mean=(0.1,) * 6))),
+            "mirror is on, but the mean of the observation is not the same left and right; turn",
+        ),
+        (lambda: Observation(mean=(0.0,) * 4), "it must be 6 values, as many as 'sincos' sees of"),
+        (lambda: Observation("state", std=(1.0,) * 6), "it must be 4 values, as many as 'state'"),
+        (lambda: Observation(std=(0.0,) * 6), "one or more values, each of which must be positive"),
+        (lambda: Observation(mean=(math.nan,) * 6), "values, each of which must be a number"),
+        (lambda: Observation(clip=0.0), "clip is 0.0; it must be positive"),
         (lambda: Observation(history=-1), "history is -1; it must not be negative"),
         (lambda: SNESConfig(population=1), "population is 1; it must be at least 2"),
         (lambda: SNESConfig(strategy="open_es", population=5), "open_es needs pairs"),
@@ -130,6 +139,8 @@ def test_what_must_fit_together_and_how_it_is_said(make, words):
 
 def test_what_is_meant_is_taken():
     assert SACConfig(batch_size=1).batch_size == 1  # without demonstrations
+    mean = (0.1, 0.2, 0.0, 0.0, 0.0, 0.0)  # of cosines, which are the same in a mirror
+    SACConfig(mirror=True, env=EnvConfig(observation=Observation(mean=mean)))
     assert Reward(floor=-math.inf, line=None).floor == -math.inf
     assert GradientConfig(memory=math.inf).memory == math.inf
     assert Run(seed=2**31 - 2).seed == 2**31 - 2
@@ -149,7 +160,7 @@ def test_values_become_pythons_own_and_hashable():
 
 # --- as mappings and in files --------------------------------------------------------------
 
-SECTIONS = ("policy", "guard", "sac", "snes")  # that a command may have no field for
+SECTIONS = ("policy", "guard", "sac", "gradient", "snes")  # that a command may have no field for
 
 
 @dataclasses.dataclass(frozen=True)

@@ -142,7 +142,7 @@ def test_environments_of_the_same_values_are_the_same_to_jit():
     assert make() != make("acrobot")
 
 
-@pytest.mark.parametrize(("kind", "size"), [("wrapped", 4), ("sincos", 6)])
+@pytest.mark.parametrize(("kind", "size"), [("wrapped", 4), ("sincos", 6), ("state", 4)])
 def test_only_the_critics_see_the_previous_action(kind, size):
     env = make(observation=Observation(kind))
     state = step(env, env.reset(jax.random.key(0)), 0.25)
@@ -274,10 +274,16 @@ def test_keys_of_either_kind_reset_to_the_same_episode():
     chex.assert_trees_all_equal(*(s.pipeline_state.world.scenario for s in (new, old)))
 
 
-@pytest.mark.parametrize("kind", ["wrapped", "sincos"])
+NORMALISED = {"mean": (0.4, 0.8, 0, 0, 0, 0), "std": (1, 2, 3, 4, 5, 0.1), "clip": 0.5}
+
+
+@pytest.mark.parametrize("kind", ["wrapped", "sincos", "sincos_clipped", "state", "normalised"])
 @pytest.mark.parametrize("randomised", [0.0, 1.0])
 def test_left_and_right_make_no_difference(kind, randomised):
-    view = Observation(kind, history=2)
+    view = Observation("sincos", history=2, **NORMALISED)
+    if kind != "normalised":
+        view = Observation(kind, history=2)
+    assert view.symmetric
     env = make(observation=view, randomised=randomised)
     world = env.reset(jax.random.key(0)).world
     rng = np.random.default_rng(0)

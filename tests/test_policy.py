@@ -74,8 +74,44 @@ def test_observations_worked_out_by_hand():
     # Angles lie on [0, 2 pi) before they are scaled, and velocities are clipped.
     wrapped = [(q1 - np.pi) / np.pi, (q2 + 4 * np.pi - np.pi) / np.pi, 0.1, -1.0]
     assert_close(Observation("wrapped")(STATE), wrapped)
+    assert_close(Observation("sincos_clipped")(STATE), [*sincos[:4], 0.1, -1.0])
+    assert_close(Observation("state")(STATE), [q1, q2, w1 / 20, w2 / 20])
     turned = STATE + np.array([2 * np.pi, -4 * np.pi, 0, 0], "f4")
     assert_close(Observation("sincos")(turned), Observation("sincos")(STATE), times=5)
+
+
+def test_observations_are_normalised_and_then_clipped():
+    wrapped, mean = Observation("wrapped")(STATE), (0.1, 0.2, -0.3, 0.4)
+    std = (0.5, 1.0, 0.01, 2.0)
+    view = Observation("wrapped", mean=mean, std=std)
+    wanted = [(w - m) / s for w, m, s in zip(wrapped, mean, std, strict=True)]
+    assert wanted[2] > 30
+    assert_close(view(STATE), wanted)
+    clipped = dataclasses.replace(view, clip=0.6)
+    assert_close(clipped(STATE), np.clip(wanted, -0.6, 0.6))
+    assert_close(Observation("wrapped", mean=mean)(STATE), wrapped - np.array(mean, "f4"))
+    # What is seen of the past is normalised too, its actions are not.
+    past = jnp.asarray([[*STATE, 0.7]])
+    assert_close(dataclasses.replace(clipped, history=1)(STATE, past),
+                 [*clipped(STATE), *clipped(STATE), 0.7])  # fmt: skip
+
+
+def test_what_looks_alike_left_and_right():
+    assert Observation("wrapped", std=(1.0, 2.0, 3.0, 4.0)).symmetric
+    assert Observation("sincos", mean=(0.5, 0.9, 0.0, 0.0, 0.0, 0.0)).symmetric
+    assert not Observation("sincos", mean=(0.5, 0.9, 0.0, 0.0, 0.0, 0.1)).symmetric
+    assert not Observation("state", mean=(1.0, 0.0, 0.0, 0.0)).symmetric
+
+
+def test_an_action_may_be_clipped_in_place_of_the_tanh():
+    policy = random_policy().replace(squash="clip")
+    pre = float(policy.pre_action(policy.observation(STATE)))
+    assert pre
+    for scale in (0.9 / abs(pre), 1.1 / abs(pre)):
+        *hidden, (kernel, bias) = policy.layers
+        scaled = policy.replace(layers=(*hidden, (kernel * scale, bias * scale)))
+        torque = scaled((None, None), 0.0, STATE)[1]
+        assert_close(torque[0], 3 * np.clip(pre * scale, -1, 1))
 
 
 def test_action_noise_is_drawn_before_the_squashing_and_anew_each_step():
@@ -133,8 +169,13 @@ def test_a_rollout_at_the_period_of_training_is_an_episode_of_the_environment(ro
 
 @both_robots
 @pytest.mark.parametrize("history", [0, 2])
-def test_file_round_trip(tmp_path, robot, history):
+@pytest.mark.parametrize("normalised", [False, True])
+def test_file_round_trip(tmp_path, robot, history, normalised):
     policy = random_policy(robot, "sincos", "tanh", history=history)
+    if normalised:
+        moments = {"mean": (1 / 3,) * 6, "std": (2 / 3,) * 6, "clip": 10.0}
+        view = dataclasses.replace(policy.observation, **moments)
+        policy = policy.replace(observation=view, squash="clip")
     path = tmp_path / "policy.npz"
     save_policy(path, policy, {"seed": 7})
     loaded = load_policy(path, robot=robot)
@@ -179,7 +220,11 @@ def test_files_of_the_first_format_still_load(tmp_path):
         (lambda a, h: h.update(torque_limit=0.0), "not finite or not positive"),
         (lambda a, h: h.update(robot="cartpole"), "unknown robot 'cartpole'"),
         (lambda a, h: h.update(activation="exp"), "unknown activation 'exp'"),
-        (lambda a, h: h["observation"].update(kind="pixels"), "it must be wrapped or sincos"),
+        (
+            lambda a, h: h["observation"].update(kind="pixels"),
+            "be wrapped, sincos, sincos_clip",
+        ),
+        (lambda a, h: h["observation"].update(mean=[0.0]), "mean is (0.0,); it must be 6 values"),
         (lambda a, h: h.update(control_dt=-1.0), "the control period is -1.0 s; it must be in"),
         (lambda a, h: h.update(control_dt=float("nan")), "the control period is nan s"),
         (lambda a, h: h.update(control_dt=1e9), "the control period is 1000000000.0 s"),
@@ -233,3 +278,11 @@ def test_velocity_scale_must_be_positive(scale):
 def test_history_must_not_be_negative():
     with pytest.raises(JaxpendError, match="history is -1; it must not be negative"):
         Observation(history=-1)
+
+
+def test_an_unknown_way_to_squash_is_refused(tmp_path):
+    path = tmp_path / "policy.npz"
+    save_policy(path, random_policy())
+    rewrite(path, lambda _, header: header["controller"]["fields"].update(squash="sine"))
+    with refused("unknown squash 'sine'; known: tanh, clip", start=str(path)):
+        load_policy(path)

@@ -1,6 +1,6 @@
 """The command line."""
 
-from .app import COMMANDS, Command, main, one_sentence, run
+from .app import COMMANDS, Command, function_of, main, one_sentence, run
 from .cache import compile_cache
 from .options import parse
 from .output import emit_json
@@ -10,6 +10,7 @@ __all__ = [
     "Command",
     "compile_cache",
     "emit_json",
+    "function_of",
     "main",
     "one_sentence",
     "parse",

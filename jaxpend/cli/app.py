@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import importlib
+import keyword
 import logging
 import re
 import signal
@@ -16,12 +17,13 @@ from .cache import VARIABLE, check_platform, compile_cache
 from .options import parse, similar
 from .output import drop_unwritable
 
-__all__ = ["COMMANDS", "Command", "main", "one_sentence", "run"]
+__all__ = ["COMMANDS", "Command", "function_of", "main", "one_sentence", "run"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """A subcommand; its function is that of its name in ``commands``."""
+    """A subcommand; its function is that of its name in ``commands``, or of ``import``, since that
+    is a word of Python, ``import_``."""
 
     group: str = ""
     summary: str = ""
@@ -60,6 +62,11 @@ COMMANDS = {
         "judge a controller",
         "every known controller on the board of a robot, next to the published rows",
         "--robot acrobot --no-robustness",
+    ),
+    "import": Command(
+        "in and out",
+        "a policy file of a Stable-Baselines3 model",
+        "model.zip --robot pendubot --preset evolsac --out policy.npz",
     ),
     "runs": Command(
         "look at runs", "list runs with their state and scores", "runs --json -", computes=False
@@ -129,9 +136,14 @@ def main(*prefix: str) -> NoReturn:
             hint = similar(name, [*COMMANDS, "--help", "--version"], "jaxpend")
             raise JaxpendError(f"unknown {what} {name!r}; {hint}")
         else:
-            found = getattr(importlib.import_module(".commands", __package__), name)
-            run(found, f"jaxpend {name}", rest, COMMANDS[name])
+            run(function_of(name), f"jaxpend {name}", rest, COMMANDS[name])
     sys.exit(0)
+
+
+def function_of(name: str) -> Callable[..., None]:
+    """The function behind a command."""
+    commands = importlib.import_module(".commands", __package__)
+    return getattr(commands, f"{name}_" if keyword.iskeyword(name) else name)
 
 
 def run(function: Callable[..., None], prog: str, args: Sequence[str] | None = None,

@@ -4,7 +4,10 @@ The header names classes and fields; only the package's own classes, and those t
 gives, are made from it, so that a file cannot run code.
 """
 
+import contextlib
 import dataclasses
+import shlex
+import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -27,7 +30,7 @@ from .hybrid import Ellipsoid, Hybrid, Tolerances
 from .lqr import LQR
 from .mpc import MPC
 from .pd import PD
-from .policy import ACTIVATIONS, Policy, network_in, policies_in
+from .policy import ACTIVATIONS, SQUASHES, Policy, network_in, policies_in
 from .riccati import Riccati
 from .tvlqr import TVLQR
 
@@ -143,6 +146,7 @@ def _check_policy(policy: Policy) -> None:
     """Refuse a policy with values that training cannot produce."""
     choose("robot", policy.robot, ROBOTS)
     choose("activation", policy.activation, ACTIVATIONS)
+    choose("squash", policy.squash, SQUASHES)
     if not isinstance(policy.observation, Observation):
         raise JaxpendError("the policy says nothing of its observation")
     period = policy.control_dt
@@ -159,10 +163,23 @@ def _check_policy(policy: Policy) -> None:
         raise JaxpendError("the policy holds values that are not finite or not positive")
 
 
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of a file; of a model of Stable-Baselines3, how to make one of it."""
+    try:
+        return read_arrays(path, "policy")
+    except JaxpendError:
+        with contextlib.suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+            if "policy.pth" in archive.namelist():
+                text = f"{path} is a model of Stable-Baselines3; make a policy file of it with"
+                line = f"jaxpend import {shlex.quote(str(path))} --robot ROBOT --out policy.npz"
+                raise JaxpendError(f"{text} {line}") from None
+        raise
+
+
 def read_header(robot_or_path: str | Path) -> dict[str, Any]:
     """The JSON header of a policy or controller file. Raises as ``arrays.read_arrays``."""
     path = shipped(robot_or_path, "policies")
-    header, _ = read_arrays(path, "policy")
+    header, _ = _read(path)
     if header.get("robot") not in [*ROBOTS] or not isinstance(header.get("provenance", {}), dict):
         raise JaxpendError(f"{path} is not a policy file: its header does not say what it is of")
     return header
@@ -185,7 +202,7 @@ def load_controller(
             is not known, or values that make no sense.
     """
     path = shipped(robot_or_path, "policies")
-    header, arrays = read_arrays(path, "policy")
+    header, arrays = _read(path)
     if header.get("format") != FORMAT:
         raise JaxpendError(f"{path} has policy format {header.get('format')}; this reads {FORMAT}")
     known = {kind.__name__: kind for kind in (*CLASSES, *classes)}

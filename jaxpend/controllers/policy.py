@@ -15,9 +15,13 @@ from ..observation import Observation
 from ..pytree import Pytree, pytree, static
 from .search_space import WEIGHT
 
-__all__ = ["ACTIVATIONS", "Memory", "Policy", "change_policies", "network_in", "policies_in"]
+__all__ = [
+    "ACTIVATIONS", "SQUASHES", "Memory", "Policy", "change_policies", "network_in", "policies_in",
+]  # fmt: skip
 
 ACTIVATIONS = {name: getattr(jax.nn, name) for name in config.ACTIVATIONS}
+# What makes an action in [-1, 1] of the network's output: tanh in SAC, clipping in most of PPO.
+SQUASHES = {"tanh": jnp.tanh, "clip": lambda pre: jnp.clip(pre, -1.0, 1.0)}
 FASTEST = 0.001  # s, the shortest time between calls at which a history still goes back far enough
 
 
@@ -60,8 +64,8 @@ class Policy(Pytree):
 
     With ``observation.history`` it sees past states and actions too, as far apart as in training
     (``control_dt``), however often it is called. ``action_noise`` is the standard deviation of
-    the noise added to the action before the tanh (SNES trains with it); None means greedy and
-    costs nothing.
+    the noise added to the action before it is squashed (SNES trains with it); None means greedy
+    and costs nothing.
     """
 
     SEARCHED: ClassVar = {"layers": WEIGHT}
@@ -71,15 +75,20 @@ class Policy(Pytree):
     robot: str = static(default="pendubot")
     observation: Observation = static(default=Observation())
     activation: str = static(default="relu")
+    squash: str = static(default="tanh")  # a name in ``SQUASHES``
     control_dt: float = static(default=0.01)  # s, the period it was trained at
 
     def pre_action(self, obs: jax.Array) -> jax.Array:
-        """The action before the tanh, scalar, for an observation (``observation.size``,)."""
+        """The action before squashing, scalar, for an observation (``observation.size``,)."""
         h = obs
         *hidden, (kernel, bias) = self.layers
         for w, b in hidden:
             h = ACTIVATIONS[self.activation](h @ w + b)
         return (h @ kernel + bias)[0]
+
+    def greedy(self, obs: jax.Array) -> jax.Array:
+        """The action in [-1, 1] without noise, scalar, for an observation."""
+        return SQUASHES[self.squash](self.pre_action(obs))
 
     def reset(self, key: jax.Array) -> tuple[jax.Array | None, Memory | None]:
         """The key for the action noise and the memory, or None where there is no such thing."""
@@ -104,7 +113,7 @@ class Policy(Pytree):
         if self.action_noise is not None:
             key, key_noise = jax.random.split(key)
             pre = pre + self.action_noise * jax.random.normal(key_noise, (), pre.dtype)
-        action = jnp.tanh(pre)
+        action = SQUASHES[self.squash](pre)
         if memory is not None:
             memory = memory.after(t, x, action)
         torque, driven = self.torque_limit * action, np.arange(2) == active_joint(self.robot)
