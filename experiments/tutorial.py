@@ -27,6 +27,7 @@ from jaxpend.plant import UPRIGHT, deviation, dynamics, forward_kinematics, tota
 from jaxpend.pytree import pytree
 from jaxpend.robustness import CRITERIA, benchmark
 from jaxpend.score import official
+from jaxpend.stepping import Stepper
 from jaxpend.sweep import survey
 
 SHORT = "--short" in sys.argv
@@ -72,6 +73,15 @@ mine = SwingAndHold(torques, lqr(plant, "pendubot").gain)
 # %% A rollout: a controller, put into a scenario, gives a trajectory
 run = jax.jit(rollout)(Scenario(plant), mine, jax.random.key(0))
 print("state after 10 s:", np.round(run.x[-1], 3))
+
+# %% From a loop of your own: a state in, a torque out, both numpy
+# On a robot nobody hands jax arrays around. ``start`` gives an object that keeps the controller's
+# memory and counts the time, 2 ms a call; ``reset`` begins a new run. ``Stepper`` does the same
+# for a controller of your own.
+stepper, own = load_policy("pendubot").start(), Stepper(mine)
+measured = np.array([0.01, 0.0, 0.0, 0.0])
+for _ in range(3):
+    print("torques:", np.round(stepper.torque(measured), 3), np.round(own.torque(measured), 3))
 
 # %% Its score: swing-up time, energy, torques and velocities in one number
 for name, controller in {"the policy that ships": load_policy("pendubot"), "mine": mine}.items():

@@ -14,7 +14,7 @@ import numpy as np
 
 from . import designs
 from .controller import robot_of
-from .criteria import HEIGHT, Criteria, ScoreV2, criteria
+from .criteria import HEIGHT, V2_HARDWARE, Criteria, ScoreV2, criteria
 from .errors import JaxpendError, choose
 from .plant import Plant
 from .robots import ROBOTS, active_joint
@@ -23,8 +23,8 @@ from .scenario import DT, Scenario
 from .variations import RANGES, sample
 
 __all__ = [
-    "CRITERIA", "HEADINGS", "V2", "Board", "Strip", "Task", "board", "own_task", "strips",
-    "task_of", "v2",
+    "CRITERIA", "HEADINGS", "V2", "Board", "Strip", "Task", "board", "hardware", "own_task",
+    "strips", "task_of", "v2",
 ]  # fmt: skip
 
 
@@ -183,6 +183,17 @@ V2 = {
 def v2(robot: str) -> Board:
     """The v2 board of a robot. Raises ``JaxpendError`` for an unknown one."""
     return V2[choose("robot", robot, V2)]
+
+
+def hardware(judged_on: "Board | str") -> Board:
+    """A board with the normalisation that runs of the real robots are scored with.
+
+    More torque cost and less smoothness count as good there. The published rows are left out.
+    """
+    simulated = board(judged_on)
+    task = dataclasses.replace(simulated.task, scoring=ScoreV2(tuple(V2_HARDWARE.items())))
+    name = f"{simulated.name}, hardware"
+    return dataclasses.replace(simulated, name=name, task=task, published=())
 
 
 def own_task(controller: Any, task: Task | None = None) -> Task:

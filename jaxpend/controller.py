@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .errors import THEIRS, JaxpendError, blame
-from .pytree import Pytree, pytree, static
+from .pytree import pytree, static
 from .robots import ROBOTS
+from .stepping import Startable
 
 __all__ = [
     "Controller", "Feedback", "Memoryless", "OpenLoop", "Zero", "check_controller", "check_form",
@@ -144,7 +145,7 @@ def check_robot(controller: Any, robot: str) -> None:
         raise JaxpendError(f"this controller is for the {its}, not for the {robot}")
 
 
-class Memoryless(Pytree):
+class Memoryless(Startable):
     """A controller whose torque depends on time and state alone."""
 
     def reset(self, key: jax.Array) -> None:

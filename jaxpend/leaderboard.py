@@ -12,10 +12,9 @@ from typing import Any
 
 import jax
 
-from .boards import HEADINGS, Board
+from .boards import HEADINGS, Board, Task
 from .controller import Controller
-from .controllers.catalogue import CATALOGUE, build
-from .controllers.files import load_controller
+from .controllers.catalogue import CATALOGUE, build, find_controller
 from .errors import JaxpendError, choose
 from .plant import Plant
 from .robustness import CRITERIA, KEYS, benchmark
@@ -115,8 +114,14 @@ def markdown(board: Mapping[str, Any]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
-def chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[str, tuple[str, Make]]:
-    """Name -> (title, make) of what the command line asks for; without names, of all."""
+def chosen(
+    controllers: str | None, policy: str | None, controller: str | None, task: Task
+) -> dict[str, tuple[str, Make]]:
+    """Name -> (title, make) of what the command line asks for; without names, of all.
+
+    ``policy`` and ``controller``, as in ``find_controller``, name one more than the others.
+    """
+    robot = task.robot
     names = list(CATALOGUE)
     if controllers is not None:
         names = [name.strip() for name in controllers.split(",") if name.strip()]
@@ -126,9 +131,11 @@ def chosen(controllers: str | None, policy: Path | None, robot: str) -> dict[str
     for name in names:
         title = CATALOGUE[choose("controller", name, CATALOGUE)].title
         chosen[name] = title, partial(build, name, robot=robot)
-    if policy is not None:
-        load_controller(policy, robot=robot)  # a wrong file is known at once
-        chosen["own_policy"] = policy.stem, lambda plant: load_controller(policy, robot=robot)
+    if policy or controller:
+        if not controller or ":" in controller:  # what is wrong is known at once, and cheaply
+            find_controller(policy, controller, task)
+        title = " ".join(filter(None, (controller, policy and Path(policy).stem)))
+        chosen["own"] = title, lambda plant: find_controller(policy, controller, task)
     return chosen
 
 

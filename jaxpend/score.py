@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .boards import Board, Task, board
 from .config import Objective
@@ -26,15 +27,19 @@ from .criteria import (
     score_v3,
     upright,
 )
+from .errors import JaxpendError
 from .plant import Plant
 from .rollout import Trajectory, rollout
 from .scenario import Scenario
 from .variations import LONGEST_DELAY
 
+# N m, with which a robot's passive joint may be driven against its friction.
+PASSIVE = 0.5
+
 __all__ = [
     "V1_DEFAULT", "V1_OFFICIAL", "V2_HARDWARE", "V2_OFFICIAL", "Criteria", "ScoreV2", "ScoreV3",
-    "combined", "criteria", "imperfect", "nominal", "nominal_run", "official", "performance",
-    "score_v1", "score_v2", "score_v3",
+    "combined", "criteria", "imperfect", "nominal", "nominal_run", "official", "official_run",
+    "performance", "recorded", "score_v1", "score_v2", "score_v3",
 ]  # fmt: skip
 
 
@@ -90,6 +95,11 @@ def nominal_run(controller: Controller, task: Task) -> tuple[Trajectory, Criteri
     return run, task.criteria(run)
 
 
+@partial(jax.jit, static_argnames="task")
+def _criteria(run: Trajectory, task: Task) -> Criteria:
+    return task.criteria(run)
+
+
 def _in_float64(leaf: Any) -> Any:
     return jnp.asarray(leaf, "f8") if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) else leaf
 
@@ -110,15 +120,67 @@ def official(controller: Controller, judged_on: Board | str) -> dict[str, Any]:
     with jax.enable_x64(True):
         controller = jax.tree.map(_in_float64, controller)
         check_controller(controller)
-        c = nominal(controller, task)
-        names = [name for name in vars(c) if name != "success"]
-        return {
-            "robot": task.robot,
-            "score": float(task.score(c)),
-            "success": bool(c.success),
-            "diverged": bool(c.diverged),
-            "criteria": {name: float(getattr(c, name)) for name in names},
-        }
+        return _plain(nominal(controller, task), task)
+
+
+def official_run(controller: Controller, judged_on: Board | str) -> tuple[Trajectory, dict]:
+    """The run that ``official`` judges, in float64, and what ``official`` says of it."""
+    task = board(judged_on).task
+    check_form(controller)
+    check_robot(controller, task.robot)
+    with jax.enable_x64(True):
+        controller = jax.tree.map(_in_float64, controller)
+        check_controller(controller)
+        run, c = nominal_run(controller, task)
+        return run, _plain(c, task)
+
+
+def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -> dict[str, Any]:
+    """What ``official`` says of a controller, of a trajectory that is there already.
+
+    Args:
+        run: of another simulator, or of a robot; with as many states as torques, or one more.
+        judged_on: a board, as in ``official``; ``boards.hardware`` for runs of a robot.
+        regular: refuse what the board's simulation cannot give: other time stamps than those of
+            its grid, torques of the passive joint. False: the run of a robot, whose clock is not
+            exact, and whose passive joint may be driven against its friction.
+
+    Raises:
+        JaxpendError: it is none of this board's runs.
+    """
+    task = board(judged_on).task
+    t, u = np.asarray(run.t, float), np.asarray(run.u, float)
+    if (last := float(t[-1])) > 1.01 * task.duration:
+        raise JaxpendError(
+            f"the run lasts {last:.3f} s; a run of this board lasts {task.duration:g}"
+        )
+    steps = np.diff(t)
+    worst = int(np.argmax(abs(steps - task.dt)))
+    if regular and (abs(steps[worst] - task.dt) > 1e-5 or abs(t[0]) > 1e-5):
+        raise JaxpendError(
+            f"the run starts at {t[0]:g} s and has a step of {steps[worst]:.6g} s; a simulated run "
+            f"of this board starts at 0 and has steps of {task.dt:g} s (a robot's: --hardware)"
+        )
+    driven, passive = (float(abs(u[:, joint]).max()) for joint in (task.joint, 1 - task.joint))
+    if passive > (1e-6 if regular else max(driven, PASSIVE)):
+        raise JaxpendError(
+            f"joint {2 - task.joint} has torques of up to {passive:.3g} N m, but the {task.robot} "
+            f"is driven at joint {task.joint + 1}; the run is that of another robot"
+        )
+    with jax.enable_x64(True):
+        return _plain(_criteria(jax.tree.map(_in_float64, run), task), task)
+
+
+def _plain(c: Criteria, task: Task) -> dict[str, Any]:
+    """Score, success and criteria as plain numbers."""
+    names = [name for name in vars(c) if name != "success"]
+    return {
+        "robot": task.robot,
+        "score": float(task.score(c)),
+        "success": bool(c.success),
+        "diverged": bool(c.diverged),
+        "criteria": {name: float(getattr(c, name)) for name in names},
+    }
 
 
 if __name__ == "__main__":

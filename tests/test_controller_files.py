@@ -122,7 +122,7 @@ def test_commands_judge_a_controller_file(tmp_path, capsys):
     assert result["criteria"] == official(hybrid, "pendubot")["criteria"]
     assert result["header"]["provenance"] == {"seed": 1}
     same(find_controller(path, None, TASK), hybrid)
-    title, make = leaderboard.chosen("lqr", path, "pendubot")["own_policy"]
+    title, make = leaderboard.chosen("lqr", path, None, task_of("pendubot"))["own"]
     assert title == "hybrid"
     same(make(PLANT), hybrid)
 

@@ -14,6 +14,7 @@ plant
 designs
 scenario
 variations
+stepping
 controller
 rollout
 criteria

@@ -8,15 +8,14 @@ import dataclasses
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 from ..config import GradientRun, Run, SACRun, Search, SNESRun, TrainRun
+from ..errors import JaxpendError
 from ..fields import Count, Natural, Positive, Robot, Seed
 from .importing import import_ as import_
+from .judging import Subject, board_of
 from .output import check_file, check_folder, emit, emit_json
-
-if TYPE_CHECKING:
-    from ..boards import Board
 
 
 def train(config: TrainRun, command: str) -> None:
@@ -45,7 +44,7 @@ def snes(config: SNESRun, command: str) -> None:
 
 def execute(config: Run, command: str) -> None:
     """``train.train``, then the score table, and where the results are."""
-    board = _board(config.robot, config.plant, config.design)
+    board = board_of(config.robot, config.plant, config.design)
     from ..runs.reader import read_run
     from ..terminal import console
     from ..train import train
@@ -57,17 +56,6 @@ def execute(config: Run, command: str) -> None:
     else:
         score_table(read_run(config.folder).results, board)
     console.print(f"policy.npz, metrics and result are in {config.folder}", soft_wrap=True)
-
-
-def _board(robot: str, plant: str | None, design: str | None) -> "Board":
-    """The v2 board of a robot; on another plant its scores are not comparable to published ones."""
-    from ..boards import task_of, v2
-
-    official, task = v2(robot), task_of(robot, plant, design)
-    if not (plant or design):
-        return official
-    name = f"{official.name} on {plant or design}"
-    return dataclasses.replace(official, name=name, task=task, published=())
 
 
 def runs(folder: Path = Path("runs"), /, json: str | None = None) -> None:
@@ -118,37 +106,80 @@ def score(
     controller: str | None = None,
     plant: str | None = None,
     design: str | None = None,
+    csv: str | None = None,
+    hardware: bool = False,
+    save: str | None = None,
     json: str | None = None,
 ) -> None:
-    """Official v2 score of a policy or any other controller, in float64.
+    """Official v2 score of a policy, of any other controller, or of a recorded run, in float64.
 
     Args:
         robot: which joint is driven: the second of the acrobot, the first of the pendubot.
         policy: a policy or controller file; by default the policy that ships with the package.
         controller: judge this instead: a known one such as tvlqr, or module:name of a
-            controller, or of a Python function (t, x) -> torque. With a policy too: the known one
-            around that policy, or the file of a controller of your own classes.
+            controller, of one written for RealAIGym, or of a Python function (t, x) -> torque.
+            With a policy too: the known one around that policy, or the file of a controller of
+            your own classes.
         plant: YAML file of the parameters of another plant than that of the boards.
         design: or an identified plant by name, such as C.1/1.0.
+        csv: judge this recorded trajectory instead, a file in the layout of RealAIGym.
+        hardware: with the normalisation for real robots; a recording may then have a clock
+            that is not exact.
+        save: write the run that is judged to this CSV file, which --csv and RealAIGym read.
         json: write the result as JSON to this file, or "-" for standard output.
     """
     check_file(json)
-    import jax
-
-    from ..controllers.catalogue import find_controller
-    from ..controllers.files import read_header
-    from ..score import official
+    check_file(save)
+    subject = Subject(robot, policy, controller, plant, design)
+    from .. import boards
     from .tables import score_table
 
-    board, file = _board(robot, plant, design), policy or (None if controller else robot)
-    about: dict[str, Any] = {"policy": file, "controller": controller, "plant": plant}
-    about |= {"design": design, "header": read_header(file) if file else None}
-    with jax.enable_x64(True):
-        judged = find_controller(policy, controller, board.task)
-    result = official(judged, board) | about
+    board = boards.hardware(subject.board) if hardware else subject.board
+    if save is not None:
+        from ..interop.csv import check_target
+
+        check_target(save)
+    if csv is None:
+        result, name = _scored(subject, board, save) | subject.about, subject.name
+    else:
+        result, name = _recorded(csv, subject, board, hardware, save), csv
     if json != "-":
-        score_table({controller or policy or f"shipped {robot}": result}, board)
+        score_table({name: result}, board)
     emit_json(result, json)
+
+
+def _scored(subject, board, save):
+    """What ``official`` says of a controller, and its run in a file."""
+    import jax
+
+    from ..score import official, official_run
+
+    with jax.enable_x64(True):
+        judged = subject.find(board)
+    if save is None:
+        return official(judged, board)
+    from ..interop.csv import save_csv
+
+    run, result = official_run(judged, board)
+    save_csv(save, run)
+    return result
+
+
+def _recorded(csv, subject, board, hardware, save):
+    """What ``recorded`` says of a file."""
+    if subject.policy or subject.controller or save:
+        given = [f"--{n}" for n in ("policy", "controller") if getattr(subject, n)]
+        text = f"--csv is a run that is there already; leave out {(given or ['--save'])[0]}"
+        raise JaxpendError(text)
+    from ..interop.csv import load_csv
+    from ..score import recorded
+
+    run = load_csv(csv)
+    try:
+        result = recorded(run, board, regular=not hardware)
+    except JaxpendError as error:
+        raise JaxpendError(f"{csv}: {error}") from None
+    return result | {"csv": csv, "plant": subject.plant, "design": subject.design}
 
 
 def robustness(
@@ -174,8 +205,9 @@ def robustness(
         robot: which joint is driven: the second of the acrobot, the first of the pendubot.
         policy: a policy or controller file; by default the policy that ships with the package.
         controller: judge this instead: a known one such as tvlqr, or module:name of a
-            controller, or of a Python function (t, x) -> torque, which takes minutes. With a
-            policy too: the known one around that policy, or the file of your own classes.
+            controller, or of one written for RealAIGym or a Python function (t, x) -> torque,
+            which take minutes. With a policy too: the known one around that policy, or the file
+            of your own classes.
         plant: YAML file of the parameters of another plant than that of the boards.
         design: or an identified plant by name, such as C.1/1.0.
         torque_limit: of the driven joint, N m; 6 on the boards.
@@ -191,20 +223,19 @@ def robustness(
     """
     check_folder(out)
     check_file(json)
+    subject = Subject(robot, policy, controller, plant, design, torque_limit)
     import jax
 
-    from ..controllers.catalogue import find_controller
     from .tables import robustness_table
 
-    board = _board(robot, plant, design)
-    task = dataclasses.replace(board.task, torque_limit=torque_limit)
+    board = subject.board
     result = {"robot": robot, "controller": controller or policy or robot, "seed": seed}
     result |= {"plant": plant, "design": design, "precision": precision}
     result["torque_limit"] = torque_limit
     with jax.enable_x64(precision == "float64"):
-        judged, key = find_controller(policy, controller, task), jax.random.key(seed)
+        judged, key = subject.find(board), jax.random.key(seed)
         options = {"scored": scored, "chunk": chunk}
-        result |= _benchmarked(judged, task.plant, key, keys, map, worst, options)
+        result |= _benchmarked(judged, board.task.plant, key, keys, map, worst, options)
     robustness_table(result, board)
     if out is not None:
         from ..report.figures import write_robustness
@@ -230,7 +261,8 @@ def _benchmarked(judged, plant, key, keys, map, worst, options):
 def leaderboard(
     robot: Robot = "pendubot",
     controllers: str | None = None,
-    policy: Path | None = None,
+    policy: str | None = None,
+    controller: str | None = None,
     plant: str | None = None,
     design: str | None = None,
     robustness: bool = True,
@@ -245,6 +277,7 @@ def leaderboard(
         robot: which joint is driven: the second of the acrobot, the first of the pendubot.
         controllers: names separated by commas; by default all that are known.
         policy: a policy or controller file to judge as well.
+        controller: or another one to judge as well, as in jaxpend score.
         plant: YAML file of the parameters of another plant than that of the boards.
         design: or an identified plant by name, such as C.1/1.0.
         robustness: run the robustness benchmark too (minutes for MPC).
@@ -262,7 +295,8 @@ def leaderboard(
     def say(line: str) -> None:
         console.print(line, style="dim")
 
-    board, chosen = _board(robot, plant, design), boards.chosen(controllers, policy, robot)
+    board = board_of(robot, plant, design)
+    chosen = boards.chosen(controllers, policy, controller, board.task)
     options = {"robustness": robustness, "keys": keys, "seed": seed}
     result = boards.leaderboard(board, chosen, say=say, **options)
     result |= {"plant": plant, "design": design}

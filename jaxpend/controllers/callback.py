@@ -1,6 +1,11 @@
-"""Any Python function of the measured state as a controller: slow, but judged like all others."""
+"""Any Python function of the measured state as a controller: slow, but judged like all others.
 
+So are controllers written for the RealAIGym ``double_pendulum`` package, which are objects.
+"""
+
+import copy
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +15,7 @@ from ..controller import Memoryless
 from ..errors import THEIRS, JaxpendError, blame
 from ..pytree import pytree, static
 
-__all__ = ["PythonLaw"]
+__all__ = ["PythonLaw", "is_realaigym", "realaigym"]
 
 
 @pytree
@@ -39,6 +44,8 @@ class PythonLaw(Memoryless):
             else:
                 u = [self.law(float(a), b) for a, b in zip(times, states, strict=True)]
             torque = np.asarray(u, x.dtype)
+        except JaxpendError:
+            raise
         except THEIRS as error:
             raise JaxpendError(f"{name} cannot be called: {blame(error)}") from None
         if torque.shape != (t.size, 2):
@@ -52,10 +59,62 @@ class PythonLaw(Memoryless):
         if not callable(self.law):
             raise JaxpendError(f"{self.law!r} is no function of (t, x); write one that is")
         if not np.isfinite(self._call(np.zeros(1, "f4"), np.zeros((1, 4), "f4"))).all():
-            raise JaxpendError("the law gives a torque that is not finite, hanging at rest")
+            name = getattr(self.law, "__name__", "the law")
+            raise JaxpendError(f"{name} gives a torque that is not finite, hanging at rest")
 
     def __call__(self, carry, t, x):
         """The law's torque, (2,)."""
         shape = jax.ShapeDtypeStruct((2,), x.dtype)
         t = jnp.asarray(t, x.dtype)
         return carry, jax.pure_callback(self._call, shape, t, x, vmap_method="broadcast_all")
+
+
+def is_realaigym(thing: Any) -> bool:
+    """Whether it is an object with the methods of a controller of RealAIGym."""
+    return not isinstance(thing, type) and callable(getattr(thing, "get_control_output_", None))
+
+
+def realaigym(controller: Any) -> PythonLaw:
+    """A controller object of RealAIGym (``get_control_output_(x, t)``, ``reset_``, ``init_``).
+
+    Every run has a copy of the object as it is now, so that the runs of a sweep do not share its
+    memory. A run begins with ``reset`` and ``init`` (or ``reset_`` and ``init_`` alone), as in the
+    benchmark of the boards, and calls ``get_control_output``, with the object's own filter and
+    compensations, where there is such a method.
+    """
+    return PythonLaw(_Copies(controller), batched=True)
+
+
+class _Copies:
+    """A law of all rollouts of a step: a call at time 0 begins as many runs as it has rows."""
+
+    def __init__(self, controller: Any) -> None:
+        self.__name__ = type(controller).__name__
+        self._original, self._running = controller, list[Any]()
+
+    def __call__(self, times: np.ndarray, states: np.ndarray) -> np.ndarray:
+        """Torques (n, 2), N m, at times (n,), s, in states (n, 4); 0 where one has diverged."""
+        if times[0] == 0 or len(self._running) != len(times):
+            self._running = [self._begun() for _ in times]
+        torques = np.zeros((len(times), 2))
+        for row, (one, t, x) in enumerate(zip(self._running, times, states, strict=True)):
+            if np.isfinite(x).all():
+                call = getattr(one, "get_control_output", one.get_control_output_)
+                torque = np.asarray(call(np.array(x, float), float(t)), float)
+                if torque.shape != (2,):
+                    text = f"{self.__name__} returns a torque of shape {torque.shape}"
+                    raise JaxpendError(f"{text}; it must be (2,)")
+                torques[row] = torque
+        return torques
+
+    def _begun(self) -> Any:
+        try:
+            one = copy.deepcopy(self._original)
+        except THEIRS as error:
+            text = f"{self.__name__} cannot be copied, and every run needs its own"
+            raise JaxpendError(f"{text}: {blame(error)}") from None
+        for names in (("reset", "reset_"), ("init", "init_")):
+            methods = (getattr(one, name, None) for name in names)
+            if begin := next(filter(callable, methods), None):
+                begin()
+        return one

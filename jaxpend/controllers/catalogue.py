@@ -13,7 +13,7 @@ from ..controller import Controller, OpenLoop, check_controller, check_robot
 from ..errors import THEIRS, JaxpendError, blame, choose
 from ..plant import Plant
 from ..trajopt.reference import Reference, load_reference
-from .callback import PythonLaw
+from .callback import PythonLaw, is_realaigym, realaigym
 from .energy import energy_shaping
 from .files import classes_of, load_controller, load_policy
 from .guard import guard
@@ -93,10 +93,10 @@ def find_controller(policy: str | Path | None, controller: str | None, task: Tas
 
     Args:
         policy: a policy or controller file; None: the policy that ships with the package.
-        controller: a name in the catalogue; or ``module:name``, a controller or a Python
-            function, looked for in the working directory too. If ``policy`` is given too, the
-            controller of the catalogue is built around it, or the file that it names is loaded
-            with the classes of ``module:name``.
+        controller: a name in the catalogue; or ``module:name``, a controller, one of RealAIGym
+            or a Python function, looked for in the working directory too. If ``policy`` is given
+            too, the controller of the catalogue is built around it, or the file that it names is
+            loaded with the classes of ``module:name``.
         task: gives the robot, and the nominal plant that a controller of the catalogue is for.
 
     Raises:
@@ -123,7 +123,9 @@ def _imported(name: str) -> Controller:
     sys.path.insert(0, str(Path.cwd()))
     try:
         found = getattr(importlib.import_module(module), attribute)
-        if not isinstance(found, type) and not hasattr(found, "reset") and callable(found):
+        if is_realaigym(found):
+            found = realaigym(found)
+        elif not isinstance(found, type) and not hasattr(found, "reset") and callable(found):
             found = PythonLaw(found)
     except THEIRS as error:
         raise JaxpendError(f"cannot load {name} as module:name: {blame(error)}") from None

@@ -10,7 +10,7 @@ import shlex
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from ..errors import JaxpendError, choose
 from ..observation import Observation
 from ..plant import Plant
 from ..robots import ROBOTS, shipped
+from ..stepping import Startable
 from ..trajopt.ilqr import Solution
 from ..trajopt.reference import Reference
 from .energy import EnergyShaping
@@ -228,10 +229,11 @@ def load_controller(
     return controller
 
 
-def load_policy(robot_or_path: str | Path, *, robot: str | None = None) -> Controller:
+def load_policy(robot_or_path: str | Path, *, robot: str | None = None) -> Startable:
     """``load_controller`` of the package's own classes: a ``Policy``, or a ``Guarded`` around it.
 
-    "acrobot" and "pendubot" are the policies that ship with the package. Raises ``JaxpendError``
-    as ``load_controller``.
+    "acrobot" and "pendubot" are the policies that ship with the package. From a loop of your own
+    they are called with ``policy.start().torque(x)``. Raises ``JaxpendError`` as
+    ``load_controller``.
     """
-    return load_controller(robot_or_path, robot=robot)
+    return cast(Startable, load_controller(robot_or_path, robot=robot))

@@ -34,6 +34,7 @@ from ..plant import UPRIGHT, Plant, deviation, rk4_step, total_energy
 from ..pytree import Pytree, pytree, static
 from ..rollout import rollout
 from ..scenario import DT
+from ..stepping import Startable
 from .energy import energy_shaping
 from .hybrid import with_lqr
 from .search_space import FACTOR
@@ -216,7 +217,7 @@ class Rescue(Pytree):
 
 
 @pytree
-class Guarded(Pytree):
+class Guarded(Startable):
     """``main`` behind an observer, before a rescue; either may be None."""
 
     main: Any

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from ..controller import Controller, check_controller
 from ..plant import Plant, deviation
 from ..pytree import Pytree, pytree
+from ..stepping import Startable
 from .lqr import LQR, lqr
 from .search_space import FACTOR
 
@@ -64,7 +65,7 @@ def ellipsoid_of_torque(top: LQR, fraction: float = 1.0, *, hysteresis: float = 
 
 
 @pytree
-class Hybrid(Pytree):
+class Hybrid(Startable):
     """``swingup`` outside the region, ``top`` inside it. Both keep their own memory."""
 
     swingup: Any

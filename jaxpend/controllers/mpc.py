@@ -21,8 +21,9 @@ import numpy as np
 from ..designs import active_joint
 from ..errors import JaxpendError
 from ..plant import Plant, deviation
-from ..pytree import Pytree, pytree, static
+from ..pytree import pytree, static
 from ..scenario import DT
+from ..stepping import Startable
 from ..trajopt.ilqr import Problem, Solution, iterate, solve, warm_start
 from ..trajopt.reference import Reference
 from ..trajopt.swingup import step
@@ -54,7 +55,7 @@ PROBLEM = Problem(step=step, features=_features, final=_final, outer=lambda p, s
 
 
 @pytree
-class MPC(Pytree):
+class MPC(Startable):
     """iLQR over a receding horizon of H steps. Its memory is the plan."""
 
     SEARCHED: ClassVar = {"q": FACTOR, "r": FACTOR, "smoothness": FACTOR}

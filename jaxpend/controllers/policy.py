@@ -13,6 +13,7 @@ from ..designs import active_joint
 from ..errors import JaxpendError
 from ..observation import Observation
 from ..pytree import Pytree, pytree, static
+from ..stepping import Startable
 from .search_space import WEIGHT
 
 __all__ = [
@@ -59,7 +60,7 @@ class Memory(Pytree):
 
 
 @pytree
-class Policy(Pytree):
+class Policy(Startable):
     """Multi-layer perceptron from an observation of the state to the driven joint's torque.
 
     With ``observation.history`` it sees past states and actions too, as far apart as in training

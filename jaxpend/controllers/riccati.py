@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from ..plant import Plant, deviation
-from ..pytree import Pytree, pytree
+from ..pytree import pytree
+from ..stepping import Startable
 from ..trajopt.reference import Reference
 from .lqr import DEFAULT_Q, DEFAULT_R, LQR, lqr
 from .search_space import OVER_TIME
@@ -22,7 +23,7 @@ __all__ = ["Riccati", "riccati"]
 
 
 @pytree
-class Riccati(Pytree):
+class Riccati(Startable):
     """Feed-forward and iLQR gains along a trajectory, then the LQR at its end."""
 
     SEARCHED: ClassVar = {"reference.gain": OVER_TIME}
