@@ -121,7 +121,7 @@ def test_more_effort_never_scores_better():
 
 @pytest.mark.x64
 def test_imperfect_runs_are_as_random_as_their_key():
-    judged = jax.jit(lambda key: imperfect(Zero(), task_of("acrobot"), key, 24).velocity_cost)
+    judged = jax.jit(lambda key: imperfect(Zero(), task_of("acrobot"), key, 24)[0].velocity_cost)
     moving = np.asarray(judged(jax.random.key(0)))
     # What hangs is moved by pulses and by torque noise alone: one third of 24, give or take.
     assert 2 < np.sum(moving > 0) < 16

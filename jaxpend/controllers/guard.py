@@ -25,6 +25,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ..controller import Controller, check_controller, check_robot
 from ..criteria import upright
@@ -103,7 +104,7 @@ class KalmanFilter(Pytree):
 
         # P = F P F' + Q, in which the shift by F is applied to rows and to columns.
         p = self._shifted(self._shifted(memory.covariance).swapaxes(0, 1))
-        p = p.at[2, 2].add(self.disturbance**2 * self.dt)
+        p = p + self.disturbance**2 * self.dt * np.diag([0.0, 0.0, 1.0])[..., None]
         correction = jnp.zeros((3, 2))
         for i in range(2):  # one measured value after the other, so that nothing is inverted
             gain = p[:, i] / (p[i, i] + noise[i])
