@@ -61,6 +61,11 @@ COMMANDS = {
         "every known controller on the board of a robot, next to the published rows",
         "--robot acrobot --no-robustness",
     ),
+    "export": Command(
+        "in and out",
+        "a controller for numpy, ONNX or C",
+        "runs/mine/policy.npz --to c --out policy.h",
+    ),
     "runs": Command(
         "look at runs", "list runs with their state and scores", "runs --json -", computes=False
     ),

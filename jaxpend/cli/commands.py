@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ..config import GradientRun, Run, SACRun, Search, SNESRun, TrainRun
 from ..fields import Count, Natural, Positive, Robot, Seed
+from .exporting import export as export
 from .output import check_file, check_folder, emit, emit_json
 
 if TYPE_CHECKING:
