@@ -68,6 +68,11 @@ COMMANDS = {
         "a policy file of a Stable-Baselines3 model",
         "model.zip --robot pendubot --preset evolsac --out policy.npz",
     ),
+    "export": Command(
+        "in and out",
+        "a controller for numpy, ONNX or C",
+        "runs/mine/policy.npz --to c --out policy.h",
+    ),
     "runs": Command(
         "look at runs", "list runs with their state and scores", "runs --json -", computes=False
     ),
