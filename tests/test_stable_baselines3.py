@@ -301,6 +301,8 @@ BAD = {
     "own class": ({"tensors": PPO, "policy_class": {"__module__": "mine"}},
                   "its policy is of a class of mine; declare whether that squashes actions by"),
     "no bounds": ({"tensors": PPO, "action_space": HUGE}, "its actions are from -inf to inf; they"),
+    "one-sided": ({"tensors": network(layers_of(4, 8, 1), "SAC"), "action_space": HUGE | {
+        "low": "[0.]", "high": "[6.]"}}, "its actions are from 0 to 6; they must be symmetric"),
     "no space": ({"tensors": PPO, "action_space": {}}, DAMAGED),
     "not json": ({"tensors": PPO, "data": "{"}, DAMAGED),
     "deep json": ({"tensors": PPO, "data": "[" * 100_000}, DAMAGED),

@@ -202,9 +202,8 @@ def _policy(
         raise JaxpendError(f"it has {len(last_bias)} actions; one is read, of the driven joint")
     if "FlattenExtractor" not in str(keywords.get("features_extractor_class", "FlattenExtractor")):
         raise JaxpendError("it has a features extractor of its own; a plain network is read")
-    squash = _squash(options, keywords, algorithm, convention)
-    if squash == "clip":  # at the ends of the action space; the others scale to it afterwards
-        bound = _bound(options)
+    squash, bound = _squash(options, keywords, algorithm, convention), _bound(options)
+    if squash == "clip":  # at the ends of the action space; what tanh gives is scaled to them
         layers[-1] = last / bound, last_bias / bound
     if order is not None:
         layers[0] = layers[0][0][list(order)], bias
