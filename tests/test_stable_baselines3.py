@@ -149,15 +149,19 @@ def test_running_statistics_normalise_and_clip(tmp_path, library, kind):
 
 
 @pytest.mark.x64
-@pytest.mark.parametrize("widths", [(6, 8, 1), (6, 1)])
-def test_cosine_and_sine_by_joint(tmp_path, widths):
-    layers, mean, var = layers_of(*widths), np.arange(6) / 10, 0.1 + np.arange(6.0)
-    path = sb3_files.model(tmp_path / "m.zip", network(layers, "SAC"))
+@pytest.mark.parametrize("algorithm", ["SAC", "PPO"])
+def test_cosine_and_sine_by_joint(tmp_path, algorithm):
+    """Normalised too; PPO with a single layer and actions in N m."""
+    layers = layers_of(6, 8, 1) if algorithm == "SAC" else layers_of(6, 1)
+    mean, var, most = np.arange(6) / 10, 0.1 + np.arange(6.0), 3.0
+    space = options()["action_space"] | {"low": f"[{-most}]", "high": f"[{most}]"}
+    path = sb3_files.model(tmp_path / "m.zip", network(layers, algorithm), action_space=space)
     np.savez(tmp_path / "s.npz", mean=mean, var=var, epsilon=1e-3)
-    convention = Convention("sincos_by_joint", 20.0, 3.0, str(tmp_path / "s.npz"))
+    convention = Convention("sincos_by_joint", 20.0, most, str(tmp_path / "s.npz"))
     seen = [(by_joint(x, 20) - mean) / np.sqrt(var + 1e-3) for x in STATES]
-    wanted = [3 * np.tanh(mean_action(layers, "relu", s)) for s in seen]
-    assert_close(torques(read_model(path, "pendubot", convention).policy, 0), wanted)
+    means = np.array([mean_action(layers, "relu", s) for s in seen])
+    wanted = most * np.tanh(means) if algorithm == "SAC" else np.clip(means, -most, most)
+    assert_close(torques(read_model(path, "pendubot", convention).policy, 0), wanted, times=1e3)
 
 
 def test_a_policy_that_was_read_can_be_trained_further(tmp_path):
