@@ -10,6 +10,7 @@ import re
 import sys
 import types
 import zipfile
+from typing import get_args
 
 import jax
 import numpy as np
@@ -22,12 +23,9 @@ from jaxpend import cli, load_policy
 from jaxpend.boards import v2
 from jaxpend.controllers.files import read_header
 from jaxpend.designs import active_joint
-from jaxpend.interop.stable_baselines3 import (
-    PRESETS,
-    Convention,
-    declared,
-    read_model,
-)
+from jaxpend.env import Env, EnvConfig
+from jaxpend.fields import hints_of, split
+from jaxpend.interop.stable_baselines3 import PRESETS, SEEN, Convention, declared, read_model
 from jaxpend.interop.tensors import StateDict
 from jaxpend.snes import SNESConfig, best_controller, evolve, init
 
@@ -151,14 +149,19 @@ def test_running_statistics_normalise_and_clip(tmp_path, library, kind):
 
 
 @pytest.mark.x64
-def test_cosine_and_sine_by_joint(tmp_path):
-    layers, mean, var = layers_of(6, 8, 1), np.arange(6) / 10, 0.1 + np.arange(6.0)
-    path = sb3_files.model(tmp_path / "m.zip", network(layers, "SAC"))
+@pytest.mark.parametrize("algorithm", ["SAC", "PPO"])
+def test_cosine_and_sine_by_joint(tmp_path, algorithm):
+    """Normalised too; PPO with a single layer and actions in N m."""
+    layers = layers_of(6, 8, 1) if algorithm == "SAC" else layers_of(6, 1)
+    mean, var, most = np.arange(6) / 10, 0.1 + np.arange(6.0), 3.0
+    space = options()["action_space"] | {"low": f"[{-most}]", "high": f"[{most}]"}
+    path = sb3_files.model(tmp_path / "m.zip", network(layers, algorithm), action_space=space)
     np.savez(tmp_path / "s.npz", mean=mean, var=var, epsilon=1e-3)
-    convention = Convention("sincos_by_joint", 20.0, 3.0, str(tmp_path / "s.npz"))
+    convention = Convention("sincos_by_joint", 20.0, most, str(tmp_path / "s.npz"))
     seen = [(by_joint(x, 20) - mean) / np.sqrt(var + 1e-3) for x in STATES]
-    wanted = [3 * np.tanh(mean_action(layers, "relu", s)) for s in seen]
-    assert_close(torques(read_model(path, "pendubot", convention).policy, 0), wanted)
+    means = np.array([mean_action(layers, "relu", s) for s in seen])
+    wanted = most * np.tanh(means) if algorithm == "SAC" else np.clip(means, -most, most)
+    assert_close(torques(read_model(path, "pendubot", convention).policy, 0), wanted, times=1e3)
 
 
 def test_a_policy_that_was_read_can_be_trained_further(tmp_path):
@@ -174,6 +177,25 @@ def test_a_policy_that_was_read_can_be_trained_further(tmp_path):
     assert best.observation == policy.observation
     assert np.isfinite(metrics["max_fitness"]).all()
     assert not np.array_equal(best.layers[0][0], policy.layers[0][0])
+
+
+def test_what_our_own_environments_show_is_a_preset(tmp_path):
+    env, layers = Env(EnvConfig(), v2("acrobot").task), layers_of(6, 8, 1)
+    path = sb3_files.model(tmp_path / "m.zip", network(layers, "SAC"))
+    policy = read_model(path, "acrobot", declared(path, "gymnasium")).policy
+    assert policy.observation == env.config.observation
+    assert policy.torque_limit == env.config.torque_limit
+    # Options go before a preset.
+    assert declared(path, "gymnasium", torque_limit=6.0).torque_limit == 6.0
+
+
+def test_the_options_are_those_of_the_convention():
+    """They are written twice, since the help of a command does not wait for jax."""
+    options, fields = hints_of(cli.function_of("import")), hints_of(Convention)
+    assert get_args(split(options["preset"])[0]) == tuple(PRESETS)
+    for key in fields.keys() - {"statistics"}:
+        assert split(options[key])[:2] == split(fields[key])[:2], key
+    assert get_args(fields["observation"]) == tuple(SEEN)
 
 
 def test_tensors_in_any_layout_are_read():
@@ -301,6 +323,8 @@ BAD = {
     "own class": ({"tensors": PPO, "policy_class": {"__module__": "mine"}},
                   "its policy is of a class of mine; declare whether that squashes actions by"),
     "no bounds": ({"tensors": PPO, "action_space": HUGE}, "its actions are from -inf to inf; they"),
+    "one-sided": ({"tensors": network(layers_of(4, 8, 1), "SAC"), "action_space": HUGE | {
+        "low": "[0.]", "high": "[6.]"}}, "its actions are from 0 to 6; they must be symmetric"),
     "no space": ({"tensors": PPO, "action_space": {}}, DAMAGED),
     "not json": ({"tensors": PPO, "data": "{"}, DAMAGED),
     "deep json": ({"tensors": PPO, "data": "[" * 100_000}, DAMAGED),
@@ -344,7 +368,7 @@ def test_what_is_no_plain_actor_is_one_sentence(here, monkeypatch, capsys, case)
     ("flip.zip --robot acrobot --preset evolsac --out p.npz", "flip.zip is not a model of Stable-"),
     ("s.npz --robot acrobot --preset evolsac --out p.npz", "s.npz: it is a zip, but no model that"),
     ("model.zip --robot acrobot --out p.npz", "declare max_velocity, observation, torque_limit, "
-     "which model.zip does not say, or a preset: evolsac, ar_eapo"),
+     "which model.zip does not say, or a preset: evolsac, ar_eapo, gymnasium"),
     ("model.zip --robot acrobot --observation state --max-velocity 1 --out p.npz",
      "declare torque_limit, which model.zip does not say"),
     ("model.zip --robot cartpole --preset evolsac --out p.npz", "--robot is 'cartpole'; it must"),

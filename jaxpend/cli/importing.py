@@ -19,7 +19,7 @@ def import_(
     robot: Robot,
     out: Path,
     command: str,
-    preset: Literal["evolsac", "ar_eapo"] | None = None,
+    preset: Literal["evolsac", "ar_eapo", "gymnasium"] | None = None,
     observation: Seen | None = None,
     max_velocity: Positive | None = None,
     torque_limit: Positive | None = None,
@@ -34,7 +34,8 @@ def import_(
         robot: which joint is driven: the second of the acrobot, the first of the pendubot.
         out: policy file to write.
         preset: declares all that a model does not say: evolsac, Evolutionary SAC; ar_eapo,
-            AR-EAPO, with the statistics in vec_normalize_env.pkl beside it. Options override it.
+            AR-EAPO, with the statistics in vec_normalize_env.pkl beside it; gymnasium, our own
+            environments as they are by default. Options override it.
         observation: what it saw. wrapped: angles mod 2 pi, scaled to [-1, 1], and clipped
             velocities; sincos: both cosines, both sines, velocities; sincos_clipped: the same
             with clipped velocities; sincos_by_joint: that with cosine and sine of the first joint

@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ..config import Activation
+from ..config import Activation, EnvConfig
 from ..controllers.policy import Policy
 from ..errors import JaxpendError, choose
 from ..fields import Checked, Positive
@@ -77,10 +77,14 @@ class Convention(Checked):
 # What the authors of published policies declared: the form of the observation in gym_env.py of the
 # reference (state_representation 2), the numbers in con_evolsac.py and con_ar_eapo.py of its v2
 # boards. AR-EAPO's policy class squashes by tanh and has its statistics beside the zip.
+# What our own Gymnasium environments show by default is a preset too.
+OURS = EnvConfig()
 PRESETS: dict[str, dict[str, Any]] = {
     "evolsac": {"observation": "wrapped", "max_velocity": 50.0, "torque_limit": 3.0},
     "ar_eapo": {"observation": "wrapped", "max_velocity": 20.0, "torque_limit": 6.0,
                 "statistics": "vec_normalize_env.pkl", "squash": "tanh"},
+    "gymnasium": {"observation": OURS.observation.kind, "torque_limit": OURS.torque_limit,
+                  "max_velocity": OURS.observation.max_velocity},
 }  # fmt: skip
 
 
@@ -194,7 +198,7 @@ def _policy(
     keywords = options.get("policy_kwargs") or {}
     kind, order = SEEN[convention.observation]
     view = Observation(kind, convention.max_velocity)  # type: ignore[arg-type]
-    (kernel, bias), (last, last_bias) = layers[0], layers[-1]
+    kernel, (last, last_bias) = layers[0][0], layers[-1]
     if len(kernel) != view.size:
         said = f"its network sees {len(kernel)} numbers, {convention.observation!r} is {view.size}"
         raise JaxpendError(f"{said}; declare the observation that it was trained with")
@@ -202,12 +206,11 @@ def _policy(
         raise JaxpendError(f"it has {len(last_bias)} actions; one is read, of the driven joint")
     if "FlattenExtractor" not in str(keywords.get("features_extractor_class", "FlattenExtractor")):
         raise JaxpendError("it has a features extractor of its own; a plain network is read")
-    squash = _squash(options, keywords, algorithm, convention)
-    if squash == "clip":  # at the ends of the action space; the others scale to it afterwards
-        bound = _bound(options)
+    squash, bound = _squash(options, keywords, algorithm, convention), _bound(options)
+    if squash == "clip":  # at the ends of the action space; what tanh gives is scaled to them
         layers[-1] = last / bound, last_bias / bound
     if order is not None:
-        layers[0] = layers[0][0][list(order)], bias
+        layers[0] = layers[0][0][list(order)], layers[0][1]
     return Policy(
         layers=tuple((jnp.asarray(w), jnp.asarray(b)) for w, b in layers),
         torque_limit=jnp.asarray(convention.torque_limit, jnp.float32),
@@ -292,7 +295,8 @@ def read_statistics(path: str | Path) -> Statistics:
             one that does not normalise observations.
     """
     try:
-        content = Path(path).read_bytes()
+        with Path(path).open("rb") as file:
+            content = file.read(MOST_PICKLE + 1)
         found = _arrays(path) if content[:2] == b"PK" else _vec_normalize(content)
         mean, var = found["mean"], found["var"]
         epsilon, clip = float(found["epsilon"]), float(found["clip"])

@@ -268,7 +268,8 @@ class StateDict:
         if not (whole and said == "storage" and isinstance(key, str) and len(shape) <= MOST_AXES):
             raise ValueError("storage")
         if kind.name not in STORAGES:
-            raise JaxpendError(f"{name} is of {shown(kind.name)}; floating-point numbers are read")
+            known = ", ".join(STORAGES)
+            raise JaxpendError(f"{name} is of {shown(kind.name)}; those that are read: {known}")
         dtype = np.dtype(self.order + STORAGES[kind.name])
         content = member(self.archive, f"{self.folder}/data/{key}", MOST_TENSORS)
         last = offset + sum((n - 1) * step for n, step in zip(shape, strides, strict=True))
