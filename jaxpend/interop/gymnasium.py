@@ -32,6 +32,7 @@ from ..config_files import from_mapping
 from ..env import Env, EnvState, restarted
 from ..errors import JaxpendError, choose
 from ..fields import Count, checked
+from ..observation import Observation
 from ..plant import forward_kinematics
 from ..pytree import Pytree, pytree
 
@@ -45,14 +46,12 @@ except ImportError:  # AutoresetMode came with 1.1
     text = "this needs the package gymnasium, 1.1 or newer: pip install 'jaxpend[gymnasium]'"
     raise JaxpendError(text) from None
 
-__all__ = ["DoublePendulum", "VectorDoublePendulum"]
+__all__ = ["NAMES", "DoublePendulum", "VectorDoublePendulum"]
 
 LARGEST = float(np.finfo(np.float32).max)
-# How much of what is seen of a state, from the front, lies within [-1, 1].
-WITHIN_ONE = {"wrapped": 4, "sincos": 4}
 FPS = 25  # pictures a second in a window
 TRAIL = 0.6  # s, for which a picture shows where the end effector has been
-FOUND = {"pendubot": "jaxpend/Pendubot-v0", "acrobot": "jaxpend/Acrobot-v0"}
+NAMES = {"pendubot": "jaxpend/Pendubot-v0", "acrobot": "jaxpend/Acrobot-v0"}
 
 
 @pytree
@@ -132,13 +131,29 @@ def _environment(robot: str, plant: str, design: str, fields: dict[str, Any]) ->
     return Env(from_mapping(EnvConfig(), given, ""), task_of(robot, plant, design))
 
 
+@cache
+def _bounds(view: Observation) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the most (obs_size,) of what can be seen, float32.
+
+    Every kind sees angles and velocities one by one, so that they are found among states with
+    extreme ones; what has no bound gets the largest number.
+    """
+    turns = np.array([-LARGEST, -1e-9, 0, np.pi / 2, np.pi, 3 * np.pi / 2, LARGEST], np.float32)
+    speeds = np.array([-LARGEST, 0, LARGEST], np.float32)
+    states = np.array([(a, a, w, w) for a in turns for w in speeds])
+    seen = np.asarray(jax.vmap(view.of_state)(states), float)
+    found = []
+    for side, most in ((-1, seen.min(axis=0)), (1, seen.max(axis=0))):
+        # What is computed otherwise is rounded otherwise; 1 is not computed.
+        most = np.where(np.abs(most) == 1, most, most + side * 1e-5 * np.abs(most))
+        rows = [most, *[np.append(most, side)] * view.history]
+        found.append(np.clip(np.concatenate(rows), -LARGEST, LARGEST).astype(np.float32))
+    return found[0], found[1]
+
+
 def _observation_space(env: Env) -> Box:
-    """Of one environment; what has no bound has the largest number of float32."""
-    view = env.config.observation
-    state, within = np.full(view.state_size, LARGEST), WITHIN_ONE.get(view.kind, 0)
-    state[:within] = 1.0
-    high = np.concatenate([state, np.tile(np.append(state, 1.0), view.history)])
-    return Box(-high.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+    """Of one environment."""
+    return Box(*_bounds(env.config.observation), dtype=np.float32)
 
 
 def _data(generator: np.random.Generator) -> np.ndarray:
@@ -222,7 +237,7 @@ class DoublePendulum(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode == "human":
             from ..report.window import Window
 
-            self._window = Window(FOUND[robot])
+            self._window = Window(NAMES[robot])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -391,7 +406,7 @@ class VectorDoublePendulum(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return tuple(_picture(self.functions, p, (), int(steps)) for p, steps in pairs)
 
 
-for _robot, _name in FOUND.items():
+for _robot, _name in NAMES.items():
     gymnasium.register(
         id=_name,
         entry_point="jaxpend.interop.gymnasium:DoublePendulum",
