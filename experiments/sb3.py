@@ -11,14 +11,11 @@ and in runs/sb3 the zip of the library and the policy of the best score so far a
 import argparse
 import importlib.metadata
 import json
+import sys
 import time
 from pathlib import Path
 
-import gymnasium
 import numpy as np
-import torch
-from stable_baselines3 import SAC
-from stable_baselines3.common.vec_env import VecEnv
 
 from jaxpend import save_policy
 from jaxpend.config import TrainRun
@@ -26,8 +23,17 @@ from jaxpend.config_files import load_config, to_mapping
 from jaxpend.designs import ROBOTS
 from jaxpend.files import write_atomically
 from jaxpend.interop import stable_baselines3 as models
-from jaxpend.interop.gymnasium import NAMES
 from jaxpend.score import official
+
+try:
+    import gymnasium
+    import torch
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.vec_env import VecEnv
+except ImportError:
+    sys.exit("this needs the package stable-baselines3: pip install 'jaxpend[sb3]'")
+
+from jaxpend.interop.gymnasium import NAMES
 
 HERE = Path(__file__).parent
 SHARE = 0.5  # of the recipe's steps
