@@ -27,7 +27,7 @@ from jaxpend.boards import v2
 from jaxpend.config import TrainRun
 from jaxpend.config_files import load_config
 from jaxpend.designs import ROBOTS
-from jaxpend.env import Env
+from jaxpend.env import Env, truncated
 from jaxpend.files import write_atomically
 from jaxpend.score import official
 
@@ -57,7 +57,7 @@ class Task:
     def step(self, key, now, action, _=None):
         """One control period, and a new episode where one is over."""
         state, steps = self.env.step(now[0], action[0]), now[1] + 1
-        over, reward = self.env.truncated(state, steps), self.scale * state.reward
+        over, reward = truncated(self.env.config, state, steps), self.scale * state.reward
         obs, fresh = self.reset(key)
         obs, now = jax.tree.map(
             lambda a, b: jnp.where(over, a, b), (obs, fresh), (state.obs, (state, steps))

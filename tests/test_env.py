@@ -17,7 +17,7 @@ from conftest import assert_close, both_robots
 from jaxpend import JaxpendError, designs
 from jaxpend.boards import v2
 from jaxpend.controllers import OpenLoop
-from jaxpend.env import Env, EnvConfig, Reward, restarted, surrogate_reward
+from jaxpend.env import Env, EnvConfig, Reward, restarted, surrogate_reward, truncated
 from jaxpend.interop.brax import DoublePendulum
 from jaxpend.observation import Observation
 from jaxpend.plant import rk4_step
@@ -342,10 +342,11 @@ def test_episodes_are_cut_off_at_the_time_limit_and_beyond_the_greatest_speed():
     x = jnp.array([[9.0, -9.0, 9.9, -9.9], [0.0, 0.0, 10.1, 0.0], [0.0, 0.0, 0.0, -10.1]])
     state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 3)).replace(x=x)
     for steps in (4, 5, 6):
-        over = env.truncated(state, jnp.full(3, steps))
+        over = truncated(env.config, state, jnp.full(3, steps))
         np.testing.assert_array_equal(over, [steps >= 5, True, True])
-        assert env.truncated(jax.tree.map(lambda leaf: leaf[0], state), steps) == over[0]
-    assert not make(duration=0.05).truncated(state, jnp.full(3, 4)).any()
+        first = jax.tree.map(lambda leaf: leaf[0], state)
+        assert truncated(env.config, first, steps) == over[0]
+    assert not truncated(EnvConfig(duration=0.05), state, jnp.full(3, 4)).any()
     now = restarted(jnp.array([True, False, True]), state.replace(x=-x), state)
     np.testing.assert_array_equal(now.x, x * jnp.array([[-1], [1], [-1]]))
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from ..env import Env, EnvState, restarted
+from ..env import Env, EnvState, restarted, truncated
 from ..plant import forward_kinematics
 from ..pytree import Pytree, pytree
 
@@ -61,7 +61,7 @@ def compiled(env: Env) -> Functions:
     def step(now, action):
         action = action[0].astype(jnp.result_type(float))
         state, steps = env.step(now.state, action), now.steps + 1
-        outcome = Outcome(state.obs, state.x, state.reward, env.truncated(state, steps))
+        outcome = Outcome(state.obs, state.x, state.reward, truncated(env.config, state, steps))
         return now.replace(state=state, steps=steps), outcome
 
     def step_all(now, actions):
