@@ -12,6 +12,7 @@ import argparse
 import importlib.metadata
 import json
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -26,9 +27,15 @@ from jaxpend.boards import v2
 from jaxpend.config import TrainRun
 from jaxpend.config_files import load_config
 from jaxpend.designs import ROBOTS
-from jaxpend.env import Env
+from jaxpend.env import Env, truncated
 from jaxpend.files import write_atomically
 from jaxpend.score import official
+
+try:
+    from gymnax.environments.spaces import Box
+    from rejax import SAC
+except ImportError:
+    sys.exit("this needs the package rejax: pip install rejax")
 
 HERE = Path(__file__).parent
 SHARE = 0.5  # of the recipe's steps: the last half brings little
@@ -50,7 +57,7 @@ class Task:
     def step(self, key, now, action, _=None):
         """One control period, and a new episode where one is over."""
         state, steps = self.env.step(now[0], action[0]), now[1] + 1
-        over, reward = self.env.truncated(state, steps), self.scale * state.reward
+        over, reward = truncated(self.env.config, state, steps), self.scale * state.reward
         obs, fresh = self.reset(key)
         obs, now = jax.tree.map(
             lambda a, b: jnp.where(over, a, b), (obs, fresh), (state.obs, (state, steps))
@@ -59,15 +66,11 @@ class Task:
 
     def action_space(self, _=None):
         """[-1, 1], as everywhere."""
-        from gymnax.environments import spaces
-
-        return spaces.Box(-1.0, 1.0, (1,))
+        return Box(-1.0, 1.0, (1,))
 
     def observation_space(self, _=None):
         """Of what the policy sees."""
-        from gymnax.environments import spaces
-
-        return spaces.Box(-jnp.inf, jnp.inf, (self.env.config.observation.size,))
+        return Box(-jnp.inf, jnp.inf, (self.env.config.observation.size,))
 
 
 def policy_of(params, env: Env) -> Policy:
@@ -85,8 +88,6 @@ def policy_of(params, env: Env) -> Policy:
 
 def train(robot: str, seed: int, steps: int, chunk: int, path: Path) -> dict:
     """One run; a row of the file. The best policy of all chunks is kept."""
-    from rejax import SAC
-
     recipe = load_config(TrainRun(robot=robot), "plain").sac
     env = Env(recipe.env, v2(robot).task)
     algorithm = SAC.create(

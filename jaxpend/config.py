@@ -98,7 +98,7 @@ class EnvConfig(Checked):
     duration: Duration = 10.0  # s, then the episode is truncated
     observation: Observation = dataclasses.field(default_factory=Observation)
     reward: Reward = dataclasses.field(default_factory=Reward)
-    max_speed: PositiveOrInfinite = math.inf  # rad/s; SAC truncates an episode beyond it
+    max_speed: PositiveOrInfinite = math.inf  # rad/s; an episode is truncated beyond it
     upright_starts: Share = 0.0  # share of episodes that start near upright, not hanging
     # rad, standard deviation of both angles there; 3/s of velocities.
     upright_spread: Positive = 0.03

@@ -22,7 +22,16 @@ from .rollout import actuate, draws, measure
 from .scenario import DT, Scenario
 from .variations import LONGEST_DELAY, sample
 
-__all__ = ["Env", "EnvConfig", "EnvState", "Reward", "World", "restarted", "surrogate_reward"]
+__all__ = [
+    "Env",
+    "EnvConfig",
+    "EnvState",
+    "Reward",
+    "World",
+    "restarted",
+    "surrogate_reward",
+    "truncated",
+]
 
 T = TypeVar("T")
 
@@ -158,14 +167,6 @@ class Env:
         reward = surrogate_reward(self.plant, self.config.reward, self.line, x, a, state.action)
         return self.observe(x, a, past, world, reward)
 
-    def truncated(self, state: EnvState, steps: jax.Array) -> jax.Array:
-        """Whether an episode is cut off in this state, after so many steps (...): bool (...).
-
-        It is at the time limit and beyond ``max_speed``.
-        """
-        speed = jnp.abs(state.x[..., 2:]).max(axis=-1)
-        return (steps >= self.config.episode_steps) | (speed > self.config.max_speed)
-
     def kicked(self, state: EnvState, change: jax.Array) -> EnvState:
         """The same with ``change`` (4,) added to the true state; in a scenario measured later."""
         return self.observe(state.x + change, state.action, state.past, state.world, state.reward)
@@ -192,6 +193,15 @@ class Env:
         view = self.config.observation
         true = dataclasses.replace(view, history=0).mirrored if self.config.randomised else ()
         return view.mirrored, (*true, -1)
+
+
+def truncated(config: EnvConfig, state: EnvState, steps: jax.Array) -> jax.Array:
+    """Whether an episode is cut off in this state, after so many steps (...): bool (...).
+
+    It is at the time limit and beyond ``max_speed``.
+    """
+    speed = jnp.abs(state.x[..., 2:]).max(axis=-1)
+    return (steps >= config.episode_steps) | (speed > config.max_speed)
 
 
 def restarted(over: jax.Array, fresh: T, now: T) -> T:

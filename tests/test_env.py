@@ -17,7 +17,7 @@ from conftest import assert_close, both_robots
 from jaxpend import JaxpendError, designs
 from jaxpend.boards import v2
 from jaxpend.controllers import OpenLoop
-from jaxpend.env import Env, EnvConfig, Reward, surrogate_reward
+from jaxpend.env import Env, EnvConfig, Reward, restarted, surrogate_reward, truncated
 from jaxpend.interop.brax import DoublePendulum
 from jaxpend.observation import Observation
 from jaxpend.plant import rk4_step
@@ -267,6 +267,22 @@ def test_brax_wrappers_count_truncate_and_reset(wrapped, key, randomised):
     assert plain.done == 0
 
 
+def test_brax_sums_the_reward_of_an_episode():
+    env = training.EvalWrapper(batched(DoublePendulum(EnvConfig(upright_starts=0.5))))
+    state, once, earned = (
+        env.reset(jax.random.split(jax.random.PRNGKey(1), 2)),
+        jax.jit(env.step),
+        [],
+    )
+    for _ in range(5):
+        state = once(state, jnp.array([[0.5], [-1.0]]))
+        earned.append(state.reward)
+    found = state.info["eval_metrics"]
+    np.testing.assert_array_equal(found.episode_steps, 3)
+    np.testing.assert_array_equal(found.active_episodes, 0)
+    assert_close(found.episode_metrics["reward"], np.sum(earned[:3], axis=0), times=5)
+
+
 def test_keys_of_either_kind_reset_to_the_same_episode():
     env = DoublePendulum(EnvConfig(randomised=1.0, upright_starts=0.5))
     new, old = (env.reset(key(7)) for key in (jax.random.key, jax.random.PRNGKey))
@@ -338,6 +354,20 @@ def test_a_share_of_episodes_starts_anywhere_among_those_that_do_not_start_uprig
 def test_nobody_who_trains_waits_for_brax():
     code = "import sys, jaxpend.env, jaxpend.sac; assert 'brax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_episodes_are_cut_off_at_the_time_limit_and_beyond_the_greatest_speed():
+    env = make(duration=0.05, max_speed=10.0)
+    x = jnp.array([[9.0, -9.0, 9.9, -9.9], [0.0, 0.0, 10.1, 0.0], [0.0, 0.0, 0.0, -10.1]])
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 3)).replace(x=x)
+    for steps in (4, 5, 6):
+        over = truncated(env.config, state, jnp.full(3, steps))
+        np.testing.assert_array_equal(over, [steps >= 5, True, True])
+        first = jax.tree.map(lambda leaf: leaf[0], state)
+        assert truncated(env.config, first, steps) == over[0]
+    assert not truncated(EnvConfig(duration=0.05), state, jnp.full(3, 4)).any()
+    now = restarted(jnp.array([True, False, True]), state.replace(x=-x), state)
+    np.testing.assert_array_equal(now.x, x * jnp.array([[-1], [1], [-1]]))
 
 
 def test_episode_steps():

@@ -21,9 +21,10 @@ class DoublePendulum(Env):
     """Acrobot or pendubot; ``pipeline_state`` is an ``EnvState``, the action has shape (1,).
 
     An observation is what the policy sees (its first ``seen_size`` entries), then what only the
-    critics see. ``done`` is always 0: Brax's ``EpisodeWrapper`` truncates. ``reset`` takes typed
-    and old-style keys, but that wrapper around a ``VmapWrapper``, as in ``training.wrap``, reads
-    the batch from the shape of the keys and needs old-style ones (``jax.random.PRNGKey``).
+    critics see. ``done`` is always 0: Brax's ``EpisodeWrapper`` truncates at its time limit, and
+    nothing does beyond ``max_speed``. ``reset`` takes typed and old-style keys, but that wrapper
+    around a ``VmapWrapper``, as in ``training.wrap``, reads the batch from the shape of the keys
+    and needs old-style ones (``jax.random.PRNGKey``).
     """
 
     def __init__(self, config: EnvConfig | None = None, task: Task | None = None):

@@ -18,22 +18,21 @@ truncated, at the time limit and beyond ``max_speed``.
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable, Sequence
-from functools import cache, partial
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..boards import task_of
 from ..config import EnvConfig
 from ..config_files import from_mapping
-from ..env import Env, EnvState, restarted
+from ..env import Env
 from ..errors import JaxpendError, choose
 from ..fields import Count, checked
-from ..plant import forward_kinematics
-from ..pytree import Pytree, pytree
+from ..observation import Observation
+from .episodes import Episode, compiled
 
 try:
     import gymnasium
@@ -45,82 +44,12 @@ except ImportError:  # AutoresetMode came with 1.1
     text = "this needs the package gymnasium, 1.1 or newer: pip install 'jaxpend[gymnasium]'"
     raise JaxpendError(text) from None
 
-__all__ = ["DoublePendulum", "VectorDoublePendulum"]
+__all__ = ["NAMES", "DoublePendulum", "VectorDoublePendulum"]
 
 LARGEST = float(np.finfo(np.float32).max)
-# How much of what is seen of a state, from the front, lies within [-1, 1].
-WITHIN_ONE = {"wrapped": 4, "sincos": 4}
 FPS = 25  # pictures a second in a window
 TRAIL = 0.6  # s, for which a picture shows where the end effector has been
-FOUND = {"pendubot": "jaxpend/Pendubot-v0", "acrobot": "jaxpend/Acrobot-v0"}
-
-
-@pytree
-class Episode(Pytree):
-    """An episode at one time."""
-
-    state: EnvState
-    steps: jax.Array  # () int, since it began
-    key: jax.Array  # of the episodes that follow
-
-
-class Outcome(NamedTuple):
-    """What a step shows: of the episode that went on, before the next one begins."""
-
-    obs: jax.Array  # (obs_size,)
-    state: jax.Array  # (4,) the true one
-    reward: jax.Array  # ()
-    over: jax.Array  # () bool
-
-
-class _Functions(NamedTuple):
-    """What is compiled for an environment: of one, and of a batch."""
-
-    begin: Callable  # keys' data -> Episode
-    follow: Callable  # Episode -> Episode, the next one
-    step: Callable  # Episode, action -> Episode, Outcome
-    begin_all: Callable
-    follow_all: Callable
-    step_all: Callable
-    points: Callable  # state (4,) -> (2, 2), see ``forward_kinematics``
-
-
-@cache
-def _compiled(env: Env) -> _Functions:
-    """Shared by all environments of the same configuration."""
-
-    def follow(key):
-        key, key_now = jax.random.split(key)
-        return Episode(env.reset(key_now), jnp.zeros((), jnp.int32), key)
-
-    def begin(data):
-        return follow(jax.random.wrap_key_data(data, impl="threefry2x32"))
-
-    def step(now, action):
-        action = action[0].astype(jnp.result_type(float))
-        state, steps = env.step(now.state, action), now.steps + 1
-        outcome = Outcome(state.obs, state.x, state.reward, env.truncated(state, steps))
-        return now.replace(state=state, steps=steps), outcome
-
-    def step_all(now, actions):
-        after, outcome = jax.vmap(step)(now, actions)
-        # To begin is dear in random scenarios, and mostly nobody has to.
-        after = jax.lax.cond(
-            outcome.over.any(),
-            lambda: restarted(outcome.over, jax.vmap(follow)(after.key), after),
-            lambda: after,
-        )
-        return after, after.state.obs, after.state.x, outcome
-
-    return _Functions(
-        begin=jax.jit(begin),
-        follow=jax.jit(lambda now: follow(now.key)),
-        step=jax.jit(step),
-        begin_all=jax.jit(jax.vmap(begin)),
-        follow_all=jax.jit(lambda now: jax.vmap(follow)(now.key)),
-        step_all=jax.jit(step_all),
-        points=jax.jit(partial(forward_kinematics, env.plant)),
-    )
+NAMES = {"pendubot": "jaxpend/Pendubot-v0", "acrobot": "jaxpend/Acrobot-v0"}
 
 
 def _environment(robot: str, plant: str, design: str, fields: dict[str, Any]) -> Env:
@@ -132,13 +61,29 @@ def _environment(robot: str, plant: str, design: str, fields: dict[str, Any]) ->
     return Env(from_mapping(EnvConfig(), given, ""), task_of(robot, plant, design))
 
 
+@cache
+def _bounds(view: Observation) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the most (obs_size,) of what can be seen, float32.
+
+    Every kind sees angles and velocities one by one, so that they are found among states with
+    extreme ones; what has no bound gets the largest number.
+    """
+    turns = np.array([-LARGEST, -1e-9, 0, np.pi / 2, np.pi, 3 * np.pi / 2, LARGEST], np.float32)
+    speeds = np.array([-LARGEST, 0, LARGEST], np.float32)
+    states = np.array([(a, a, w, w) for a in turns for w in speeds])
+    seen = np.array(jax.vmap(view.of_state)(jax.numpy.asarray(states)), np.float64)
+    found = []
+    for side, most in ((-1, seen.min(axis=0)), (1, seen.max(axis=0))):
+        # What is computed otherwise is rounded otherwise; 1 is not computed.
+        most = np.where(np.abs(most) == 1, most, most + side * 1e-5 * np.abs(most))
+        rows = [most, *[np.append(most, side)] * view.history]
+        found.append(np.clip(np.concatenate(rows), -LARGEST, LARGEST).astype(np.float32))
+    return found[0], found[1]
+
+
 def _observation_space(env: Env) -> Box:
-    """Of one environment; what has no bound has the largest number of float32."""
-    view = env.config.observation
-    state, within = np.full(view.state_size, LARGEST), WITHIN_ONE.get(view.kind, 0)
-    state[:within] = 1.0
-    high = np.concatenate([state, np.tile(np.append(state, 1.0), view.history)])
-    return Box(-high.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+    """Of one environment."""
+    return Box(*_bounds(env.config.observation), dtype=np.float32)
 
 
 def _data(generator: np.random.Generator) -> np.ndarray:
@@ -214,7 +159,7 @@ class DoublePendulum(gymnasium.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self.observation_space = _observation_space(self.functions)
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
-        self._compiled = _compiled(self.functions)
+        self._compiled = compiled(self.functions)
         self._episode: Episode | None = None
         self._steps = 0
         self._tips: deque[np.ndarray] = deque(maxlen=max(round(TRAIL / dt), 2))
@@ -222,7 +167,7 @@ class DoublePendulum(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode == "human":
             from ..report.window import Window
 
-            self._window = Window(FOUND[robot])
+            self._window = Window(NAMES[robot])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -324,7 +269,7 @@ class VectorDoublePendulum(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._compiled = _compiled(env)
+        self._compiled = compiled(env)
         self._episodes: Episode | None = None
 
     def reset(
@@ -391,7 +336,7 @@ class VectorDoublePendulum(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return tuple(_picture(self.functions, p, (), int(steps)) for p, steps in pairs)
 
 
-for _robot, _name in FOUND.items():
+for _robot, _name in NAMES.items():
     gymnasium.register(
         id=_name,
         entry_point="jaxpend.interop.gymnasium:DoublePendulum",

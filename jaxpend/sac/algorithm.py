@@ -15,7 +15,7 @@ import optax
 from ..boards import Task
 from ..config import SACConfig
 from ..controllers.policy import Policy
-from ..env import Env, EnvState, restarted
+from ..env import Env, EnvState, restarted, truncated
 from ..pytree import Pytree, pytree
 from . import losses, replay
 from .critics import Critic, TwinCritic
@@ -238,12 +238,12 @@ def interact(agent: Agent, state: SACState, key: jax.Array) -> tuple[SACState, j
     action = jnp.where(state.env_steps < config.warmup_steps, uniform, action)
     after = jax.vmap(env.step)(before, action)
     now = Transition.between(before, action, after, config.reward_scale)
-    truncated = env.truncated(after, state.env_time + 1)
+    over = truncated(config.env, after, state.env_time + 1)
     fresh = jax.vmap(env.reset)(jax.random.split(key_reset, config.num_envs))
     state = state.replace(
-        replay=replay.add(state.replay, now, truncated),
-        envs=restarted(truncated, fresh, after),
-        env_time=jnp.where(truncated, 0, state.env_time + 1),
+        replay=replay.add(state.replay, now, over),
+        envs=restarted(over, fresh, after),
+        env_time=jnp.where(over, 0, state.env_time + 1),
         env_steps=state.env_steps + config.num_envs,
     )
     return state, after.reward.mean()
