@@ -1,12 +1,14 @@
 """The shipped policies as submissions, run by the RealAIGym package itself, beside ours.
 
     python experiments/reference_check.py DOUBLE_PENDULUM [--robots acrobot pendubot] [--runs 60]
+    python experiments/reference_check.py DOUBLE_PENDULUM --recordings
 
 DOUBLE_PENDULUM is a checkout of github.com/dfki-ric-underactuated-lab/double_pendulum, of which
 nothing is changed; its plant needs sympy and pandas (``pip install sympy pandas``). Each robot's
 policy is exported (``interop.realaigym``), and its numpy controller is judged there: the score of
 the performance board, and runs of the robustness board, with the same draws of noise and the same
 pulses on both sides. Says how far the scores are apart, and how many flags of success are equal.
+``--recordings``: the scores of the runs of robots that the checkout holds, there and here.
 """
 
 import argparse
@@ -16,6 +18,7 @@ import dataclasses
 import importlib.util
 import io
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -24,12 +27,13 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxpend.boards import Board, Strip, v2
+from jaxpend.boards import Board, Strip, hardware, v2
 from jaxpend.controllers.files import load_policy
 from jaxpend.interop import realaigym
+from jaxpend.interop.csv import load_csv
 from jaxpend.rollout import rollout
 from jaxpend.scenario import NEUTRAL, Pulses, Scenario, with_neutral
-from jaxpend.score import official
+from jaxpend.score import official, recorded
 from jaxpend.sweep import upright
 from jaxpend.variations import vary
 
@@ -172,7 +176,8 @@ def compare(robot: str, checkout: Path, most: int, folder: Path) -> tuple[int, i
     with contextlib.redirect_stdout(io.StringIO()):
         theirs = score_there(controller, about, folder)
     ours = official(load_policy(robot), board)["score"]
-    print(f"{robot}: score there {theirs:.10f}, here {ours:.10f}, apart {abs(ours - theirs):.1e}")
+    apart = f"apart {abs(ours - theirs):.1e}"
+    print(f"{robot}: score there {theirs:.10f}, here {ours:.10f}, {apart}", flush=True)
     with jax.enable_x64(True):
         runs = chosen(board.trials(board.task.plant), most)
         pulses = {run.seed: pulses_of(run.seed) for run in runs if run.variation == "perturbation"}
@@ -194,16 +199,45 @@ def compare(robot: str, checkout: Path, most: int, folder: Path) -> tuple[int, i
     return len(runs), equal
 
 
+def recordings(checkout: Path, folder: Path) -> None:
+    """The scores of the runs that the hardware boards keep, there and here."""
+    from double_pendulum.analysis.leaderboard import leaderboard_scores
+    from double_pendulum.model.model_parameters import model_parameters
+
+    # Of the plant only the lengths of its links count here.
+    at = "data/system_identification/identified_parameters/design_C.1/model_1.0"
+    about = model_parameters(filepath=str(checkout / at / "model_parameters.yml"))
+    apart = []
+    for path in sorted(checkout.glob("leaderboard/*/real_hardware*_v2/**/trajectory.csv")):
+        board = hardware(path.relative_to(checkout).parts[1])
+        shutil.copy(path, folder / "trajectory.csv")  # the reference writes beside it
+        entry = {"csv_path": str(folder / "trajectory.csv"), "name": "", "username": ""}
+        norms = dict(board.task.scoring.norms)
+        weights = dict.fromkeys(norms, 1.0) | {"max_tau": 0.0, "integ_tau": 0.0}
+        leaderboard_scores(
+            {"": entry | {"short_description": ""}}, folder / "entry.csv", about,
+            weights=weights, normalize=norms, simulation=False, score_version="v2",
+        )  # fmt: skip
+        with (folder / "scores_v2.csv").open() as file:
+            theirs = float(next(csv.DictReader(file))["RealAI Score"])
+        apart.append(abs(recorded(load_csv(path), board, regular=False)["score"] - theirs))
+    print(f"{len(apart)} recordings of robots: scores at most {max(apart):.1e} apart", flush=True)
+
+
 def main() -> None:
     """Compare the robots; exits with 1 if a flag differs."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("checkout", type=Path)
     parser.add_argument("--robots", nargs="+", default=["acrobot", "pendubot"])
     parser.add_argument("--runs", type=int, default=60)
+    parser.add_argument("--recordings", action="store_true", help="those of robots instead")
     args = parser.parse_args()
     sys.path.insert(0, str(args.checkout / "src" / "python"))
     os.environ.setdefault("MPLBACKEND", "agg")
     with tempfile.TemporaryDirectory() as folder:
+        if args.recordings:
+            recordings(args.checkout, Path(folder))
+            return
         done = [compare(robot, args.checkout, args.runs, Path(folder)) for robot in args.robots]
     total, equal = (sum(numbers) for numbers in zip(*done, strict=True))
     print(f"together: equal flags on {equal} of {total} runs")

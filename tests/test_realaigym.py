@@ -13,7 +13,7 @@ from jaxpend import load_policy, rollout
 from jaxpend.boards import v2
 from jaxpend.controllers import pd
 from jaxpend.controllers.catalogue import find_controller
-from jaxpend.interop.realaigym import check_target, submission, write
+from jaxpend.interop.realaigym import check_target, export, submission, write
 from jaxpend.leaderboard import judge
 
 ROBOT = "pendubot"
@@ -137,6 +137,25 @@ def test_a_folder_is_judged_and_written(tmp_path):
     write(make, v2(ROBOT), folder, robustness=False)  # its own it may replace
     assert sorted(folder.rglob("*")) == before
     assert len([path for path in before if path.is_file()]) == 7
+
+
+def test_a_file_says_its_robot(tmp_path, monkeypatch):
+    judged = []
+
+    def judge(make, board, **options):
+        judged.append((make(board.task.plant).main.robot, board.robot, options))
+        return JUDGED
+
+    monkeypatch.setattr("jaxpend.interop.realaigym.judge", judge)
+    assert export("acrobot", tmp_path / "theirs", keys=5) is JUDGED
+    assert judged == [("acrobot", "acrobot", {"keys": 5})]
+    law = tmp_path / "theirs/src/python/double_pendulum/controller/theirs/theirs_controller.py"
+    names = {}
+    exec(law.read_text(), names)
+    one = names["TheirsController"]()
+    torque = one.get_control_output_([0.0, 0.2, 0.0, 0.0], 0.0)
+    assert torque[0] == 0 != torque[1]
+    assert (tmp_path / "theirs/leaderboard/acrobot/robustness_v2/con_theirs.py").is_file()
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,9 @@ from typing import Any
 
 import jax
 
-from ..boards import HEADINGS, Board
+from ..boards import HEADINGS, Board, v2
 from ..controller import Controller, check_robot
+from ..controllers.files import load_controller, read_header
 from ..errors import JaxpendError
 from ..files import write_atomically
 from ..leaderboard import judge
@@ -24,7 +25,7 @@ from ..plant import Plant
 from ..robustness import CRITERIA
 from .numpy import source
 
-__all__ = ["check_target", "submission", "write"]
+__all__ = ["check_target", "export", "submission", "write"]
 
 TITLE = "a submission of jaxpend to RealAIGym"
 BOARDS = ("simulation_v2", "robustness_v2")  # folders there, for performance and robustness
@@ -207,3 +208,10 @@ def write(
     for path, text in files.items():
         write_atomically(folder / path, text)
     return found
+
+
+def export(robot_or_path: str | Path, folder: str | Path, **options: Any) -> dict[str, Any]:
+    """``write`` for a policy or controller file, or by a robot's name the policy that ships."""
+    check_target(folder)
+    board = v2(read_header(robot_or_path)["robot"])
+    return write(lambda plant: load_controller(robot_or_path), board, folder, **options)
