@@ -9,6 +9,7 @@ import pytest
 from conftest import refused, rewrite, task_of
 
 from jaxpend import JaxpendError, Policy, designs, leaderboard, load_policy, save_policy
+from jaxpend.boards import v2
 from jaxpend.cli import commands
 from jaxpend.controller import Memoryless
 from jaxpend.controllers import Feedback, Reference, load_controller, lqr, save_controller
@@ -17,6 +18,8 @@ from jaxpend.controllers.files import classes_of
 from jaxpend.controllers.hybrid import with_lqr
 from jaxpend.controllers.policy import network_in
 from jaxpend.pytree import pytree, static
+from jaxpend.report.judged import judge
+from jaxpend.runs.reader import find
 from jaxpend.score import official
 
 PLANT, TASK = designs.competition("pendubot"), task_of("pendubot")
@@ -145,6 +148,24 @@ def test_a_name_and_a_file_together(tmp_path):
     name = f"{__name__}:OWN"
     same(find_controller(path, name, TASK), OWN)
     assert find_controller(None, name, TASK) is OWN
+
+
+def test_every_command_that_judges_takes_a_file_of_own_classes(tmp_path, capsys):
+    path, name = tmp_path / "own.npz", f"{__name__}:OWN"
+    save_controller(path, OWN, "pendubot")
+    commands.score("pendubot", str(path), name, json="-")
+    result = json.loads(capsys.readouterr().out)
+    assert result["criteria"] == official(OWN, "pendubot")["criteria"]
+    assert (result["policy"], result["controller"]) == (str(path), name)
+    title, make = leaderboard.chosen("lqr", str(path), name, TASK)["own"]
+    assert title == f"{name} own"
+    same(make(PLANT), OWN)
+    (run,) = find(path)
+    judged = judge(run, v2("pendubot"), robustness=False, controller=name)
+    assert judged.score == pytest.approx(result["score"], abs=1e-9)
+    assert judged.criteria == pytest.approx(result["criteria"], rel=1e-6)
+    with refused("unknown class of a controller 'Own'", start=str(path)):
+        judge(run, v2("pendubot"), robustness=False)
 
 
 def test_a_module_that_ends_the_program_is_one_sentence(tmp_path, monkeypatch):

@@ -320,7 +320,7 @@ class Breaking:
 
 @pytest.mark.parametrize("steps", [0, 7])
 def test_a_run_that_diverges_is_shown_as_far_as_it_went(tmp_path, monkeypatch, steps):
-    monkeypatch.setattr("jaxpend.report.judged.load_controller", lambda *_, **__: Breaking(steps))
+    monkeypatch.setattr("jaxpend.report.judged.find_controller", lambda *_, **__: Breaking(steps))
     monkeypatch.setattr("jaxpend.report.judged.read_header", lambda _: {})
     run = report.RunRecord("broken", "pendubot", {}, (), [], None, "pendubot")
     path = page.write([run], tmp_path, title="broken", robustness=False)

@@ -76,12 +76,16 @@ def runs(folder: Path = Path("runs"), /, json: str | None = None) -> None:
     emit_json(entries, json)
 
 
-def report(run: Path, /, out: Path | None = None, robustness: bool = True) -> None:
+def report(
+    run: Path, /, controller: str | None = None, out: Path | None = None, robustness: bool = True
+) -> None:
     """One page about a run, report.html, that needs no network, and pictures beside it.
 
     Args:
         run: a run folder, finished or not, a folder of seeds, a policy or controller file, or
             acrobot or pendubot for the policy that ships with the package.
+        controller: judge this instead, as in jaxpend score: the known one around that policy,
+            or with module:name the file of your own classes; any, where RUN is a robot.
         out: folder for report.html and report/*.png; by default the run folder, or else
             runs/NAME.
         robustness: run the robustness benchmark too, seconds for every seed.
@@ -96,7 +100,8 @@ def report(run: Path, /, out: Path | None = None, robustness: bool = True) -> No
         console.print(sentence, soft_wrap=True)
     from ..report.page import write
 
-    page = write(found, folder, title=run.resolve().name, robustness=robustness)
+    title = ", ".join(filter(None, (run.resolve().name, controller)))
+    page = write(found, folder, title=title, robustness=robustness, controller=controller)
     pictures = page.with_suffix("")
     console.print(f"the report is {page}; pictures are in {pictures}", soft_wrap=True)
 
@@ -141,7 +146,8 @@ def score(
 
         check_target(save)
     if csv is None:
-        result, name = _scored(subject, board, save) | subject.about, subject.name
+        about, name = subject.about, subject.name
+        result = _scored(subject, board, save) | about
     else:
         result, name = _recorded(csv, subject, board, hardware, save), csv
     if json != "-":

@@ -2,14 +2,17 @@
 
 import dataclasses
 import math
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 
 from ..boards import HEADINGS, Board, Task
-from ..controllers.files import load_controller, read_header
+from ..controllers.catalogue import find_controller
+from ..controllers.files import read_header
 from ..plant import forward_kinematics
+from ..robots import ROBOTS
 from ..robustness import benchmark
 from ..runs.reader import RunRecord
 from ..score import nominal_run
@@ -60,7 +63,9 @@ class Judged:
         return min(self.whole, max(3.0, float(round(2.5 * self.up))))
 
 
-def judge(run: RunRecord, board: Board, robustness: bool = True) -> Judged | None:
+def judge(
+    run: RunRecord, board: Board, robustness: bool = True, controller: str | None = None
+) -> Judged | None:
     """The official run of a run's best policy so far, its score, and its robustness.
 
     The policies of several seeds share one compilation.
@@ -69,18 +74,20 @@ def judge(run: RunRecord, board: Board, robustness: bool = True) -> Judged | Non
         run: its policy is judged; the result is None where there is none yet.
         board: whose task it is judged on.
         robustness: run the benchmark too.
+        controller: as in ``find_controller``, with the run's policy; alone, where that is the
+            one that ships with the package.
     """
     if run.policy is None:
         return None
     task, report = board.task, None
+    policy = None if controller and run.policy in ROBOTS else run.policy
+    found = partial(find_controller, policy, controller, task)
     with jax.enable_x64(True):
-        trajectory, c = nominal_run(load_controller(run.policy, robot=run.robot), task)
+        trajectory, c = nominal_run(found(), task)
         score = float(task.score(c))
         points = jax.vmap(forward_kinematics, (None, 0))(task.plant, trajectory.x)
     if robustness:
-        policy = load_controller(run.policy, robot=run.robot)
-        found = benchmark(policy, board, jax.random.key(0))
-        report = {"robot": run.robot} | found.as_dict()
+        report = {"robot": run.robot} | benchmark(found(), board, jax.random.key(0)).as_dict()
     x = np.asarray(trajectory.x)
     samples = np.isfinite(x).all(axis=1).cumprod().sum()  # the first one is the start
     return Judged(
@@ -92,7 +99,7 @@ def judge(run: RunRecord, board: Board, robustness: bool = True) -> Judged | Non
         x=x[:samples],
         u=np.asarray(trajectory.u)[: samples - 1],
         points=np.asarray(points)[:samples],
-        header=read_header(run.policy),
+        header=read_header(policy) if policy else {},
         report=report,
     )
 

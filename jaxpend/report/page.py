@@ -146,6 +146,7 @@ def write(
     title: str,
     robustness: bool = True,
     board: Board | None = None,
+    controller: str | None = None,
 ) -> Path:
     """Judge what the runs have left, and write ``report.html`` and the pictures of ``report/``.
 
@@ -155,6 +156,7 @@ def write(
         title: name of the run, or of the folder of seeds.
         robustness: run the benchmark for every seed; what is reported is the median over keys.
         board: to judge on; by default the v2 board of the runs' robot.
+        controller: judged with the runs' policies, or instead of them; as in ``judge``.
 
     Returns:
         The path of the page.
@@ -162,7 +164,7 @@ def write(
     pictures, title = folder / "report", _legible(title)
     runs = [dataclasses.replace(run, name=_legible(run.name)) for run in runs]
     board = _board(runs[0]) if board is None else board
-    judged = [judge(run, board, robustness) for run in runs]
+    judged = [judge(run, board, robustness, controller) for run in runs]
     known = [(run, found) for run, found in zip(runs, judged, strict=True) if found]
     context = _about(runs, judged, board, title)
     learning = list(_learning(runs))
