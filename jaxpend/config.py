@@ -160,6 +160,8 @@ class SACConfig(Checked):
     n_step: Annotated[int, Bounds(least=1, most=100)] = 1  # rewards before a target bootstraps
     # Polyak averaging of the target critics.
     target_rate: Annotated[float, Bounds(above=0, most=1)] = 0.005
+    # The same of the actor, whose average is the greedy policy; 1: it is the actor itself.
+    average_rate: Annotated[float, Bounds(above=0, most=1)] = 1.0
     learning_rate: Positive = 1e-3
     final_learning_rate: Positive = 1.0  # cosine decay to this fraction of learning_rate
     target_entropy: float = -1.0  # nats

@@ -347,6 +347,24 @@ def test_episodes_end_by_time_and_by_speed_and_start_anew():
     assert len(set(starts)) == len(starts) > 8  # a fresh key at every reset
 
 
+def test_the_greedy_policy_is_that_of_the_averaged_actor():
+    agent = sac.Agent(small(env=EnvConfig(), average_rate=0.25), TASK)
+    state = sac.init(agent, KEY)
+    rows = np.random.default_rng(0).uniform(-1, 1, (64, 2 * 7 + 2))
+    batch, before = transitions(rows, 6), state.average
+    after, _ = sac.update(agent, state, batch, KEY)
+    expected = jax.tree.map(lambda old, new: 0.75 * old + 0.25 * new, before, after.actor)
+    jax.tree.map(lambda a, b: assert_close(a, b), after.average, expected)
+    assert not leaves_equal(after.average, after.actor)
+    kernel = after.average["params"]["mean"]["kernel"]
+    np.testing.assert_array_equal(sac.greedy_policy(agent, after).layers[-1][0], kernel)
+    # What is put in its place, such as an actor that imitates, is where it starts from.
+    placed = sac.with_actor(state, after.actor)
+    assert leaves_equal(placed.average, after.actor)
+    plain = sac.with_actor(sac.init(CREDIT, KEY), after.actor)
+    assert plain.average is None
+
+
 def test_where_episodes_end_is_kept_for_several_steps():
     agent = changed(REPLAY, n_step=2)
     state = sac.init(agent, KEY)

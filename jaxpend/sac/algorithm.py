@@ -36,6 +36,7 @@ __all__ = [
     "train_chunk",
     "train_chunks",
     "update",
+    "with_actor",
 ]
 
 Metrics = dict[str, jax.Array]
@@ -91,6 +92,7 @@ class SACState(Pytree):
     key: jax.Array
     env_steps: jax.Array  # () int
     updates: jax.Array  # () int
+    average: Params | None = None  # of the actor, with ``config.average_rate``
 
 
 def init(agent: Agent, key: jax.Array) -> SACState:
@@ -104,7 +106,13 @@ def init(agent: Agent, key: jax.Array) -> SACState:
     if learner is None:
         return state
     learner, _ = imitate_chunk(agent, state, learner, agent.config.demonstrations.updates)
-    return state.replace(actor=learner.params)
+    return with_actor(state, learner.params)
+
+
+def with_actor(state: SACState, params: Params) -> SACState:
+    """The state with another actor, from which its average, where there is one, starts too."""
+    average = None if state.average is None else params
+    return state.replace(actor=params, average=average)
 
 
 def begin(agent: Agent, key: jax.Array) -> tuple[SACState, Imitation | None]:
@@ -173,6 +181,7 @@ def _fresh(agent: Agent, key: jax.Array) -> SACState:
         key=key,
         env_steps=zero,
         updates=zero,
+        average=jax.tree.map(jnp.copy, actor) if config.average_rate < 1 else None,
     )
 
 
@@ -212,8 +221,13 @@ def update(
     updates = jax.tree.map(lambda u: jnp.where(learns, u, 0.0), updates)
     slope = losses.temperature_slope(state.log_temperature, entropy, config.target_entropy)
     step, temperature_opt = opt.update(slope, state.temperature_opt)
+    actor_params = optax.apply_updates(state.actor, updates)
+    average = None
+    if state.average is not None:
+        average = optax.incremental_update(actor_params, state.average, config.average_rate)
     state = state.replace(
-        actor=optax.apply_updates(state.actor, updates),
+        actor=actor_params,
+        average=average,
         critic=critic_params,
         target=optax.incremental_update(critic_params, state.target, config.target_rate),
         log_temperature=state.log_temperature + jnp.where(learns, step, 0.0),
@@ -325,5 +339,10 @@ def train_chunks(
 
 
 def greedy_policy(agent: Agent, state: SACState) -> Policy:
-    """The deterministic policy as a ``Controller``."""
-    return to_policy(state.actor, agent.actor, agent.env)
+    """The deterministic policy as a ``Controller``.
+
+    With ``config.average_rate`` it is that of the averaged actor (Polyak and Juditsky, 1992), which
+    wanders less from judgement to judgement than the actor does.
+    """
+    actor = state.actor if state.average is None else state.average
+    return to_policy(actor, agent.actor, agent.env)

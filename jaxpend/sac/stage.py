@@ -72,7 +72,7 @@ class Imitation(Stage[None, ImitationState, SACState]):
         return state.replace(learner=state.learner.replace(key=key))
 
     def outcome(self, state: ImitationState, best: None) -> SACState:
-        return state.sac.replace(actor=state.learner.params)
+        return algorithm.with_actor(state.sac, state.learner.params)
 
 
 def chunk_length(total: int, most: int) -> int:
