@@ -14,10 +14,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxpend import cli, designs
+from jaxpend import cli, designs, load_policy
 from jaxpend.controllers import energy_shaping, guard, load_reference, tvlqr
 from jaxpend.controllers.guard import REGION, SURPLUS
 from jaxpend.controllers.hybrid import with_lqr
+from jaxpend.controllers.policy import network_in
 from jaxpend.files import write_atomically
 from jaxpend.rollout import final_state
 from jaxpend.scenario import Scenario
@@ -32,6 +33,7 @@ SENSORS = {  # heading -> variation and value
 }
 SENSED = 64  # runs each
 STIFF = "TVLQR ending in LQR, which tolerates less delay"
+SHIPPED = "the network that ships"
 
 
 def variants(robot: str) -> dict[str, dict]:
@@ -41,6 +43,8 @@ def variants(robot: str) -> dict[str, dict]:
     return {
         "as it is": {},
         STIFF: {},
+        SHIPPED: {},
+        f"{SHIPPED}, no guard": {"observe": False, "rescue": False},
         "no guard": {"observe": False, "rescue": False},
         "observer alone": {"rescue": False},
         "rescue alone": {"observe": False},
@@ -117,12 +121,13 @@ def main(runs: int = 1024, seed: int = 0, out: Path = Path(__file__).parent / "g
         keys = jax.random.split(jax.random.key(seed + 1), len(kinds))
         demonstrated = tvlqr(plant, load_reference(robot), r=10.0, delay=0.044)
         stiff = tvlqr(plant, load_reference(robot), r=10.0)
+        shipped = network_in(load_policy(robot))
         lines += ["", f"## {robot}", "", "| guard | all | " + " | ".join([*KINDS, *SENSORS]) + " |"]
         lines += ["|---|" + "---:|" * (1 + len(KINDS) + len(SENSORS))]
         for name, changes in variants(robot).items():
             print(robot, name, file=sys.stderr)
-            controller = stiff if name == STIFF else demonstrated
-            guarded = build(controller, robot, changes)
+            network = shipped if name.startswith(SHIPPED) else demonstrated
+            guarded = build(stiff if name == STIFF else network, robot, changes)
             ok = np.asarray(survives(guarded, scenarios, keys))
             cells = [ok.mean(), *(ok[kinds == i].mean() for i in range(len(KINDS)))]
             cells += [survives(guarded, s, keys[:SENSED]).mean() for s in sensors(plant, seed)]

@@ -122,9 +122,10 @@ print(found.success.astype(int))
 # %% SNES, an evolution strategy: what a controller declares in SEARCHED is improved
 # The gain of ``mine`` leaves nothing to gain, so take a controller whose numbers were chosen by
 # hand: energy shaping, with LQR at the top. A generation draws controllers around the mean of the
-# search, here 5 % away, and moves the mean towards the better ones. With ``scenarios=8`` the
-# fitness would hold the mean score in random imperfect scenarios too. The search does not know
-# the controller that it started from, so that controller stays if the best one found is no better.
+# search, here 5 % away, and moves the mean towards the better ones. With ``scenarios=8`` and
+# ``objective=Objective(0.5)`` half of the fitness would be the mean score in random imperfect
+# scenarios. The search does not know the controller that it started from, so that controller stays
+# if the best one found is no better.
 by_hand = build("energy_lqr", plant, "pendubot")
 config = SNESConfig(generations=20 if SHORT else 60, population=12 if SHORT else 40)
 search = snes.init(config, by_hand, jax.random.key(2))
