@@ -2,7 +2,9 @@
 
 git clone https://github.com/dfki-ric-underactuated-lab/double_pendulum
 python experiments/published.py double_pendulum/data/policies/design_C.1
+python experiments/published.py double_pendulum/data/policies/design_C.1 --rounding 8
 
+The second prints how far the criterion of delay, in which nothing is drawn, depends on rounding.
 Nothing of that repository is copied; the script reads the models where they lie.
 """
 
@@ -10,12 +12,16 @@ import dataclasses
 import itertools
 from pathlib import Path
 
-from jaxpend import cli, leaderboard
-from jaxpend.boards import v2
-from jaxpend.fields import Count, Seed
+import jax
+import numpy as np
+
+from jaxpend import Policy, cli, leaderboard
+from jaxpend.boards import Task, strips, v2
+from jaxpend.fields import Count, Natural, Seed
 from jaxpend.files import write_atomically
 from jaxpend.interop.stable_baselines3 import declared, read_model
 from jaxpend.robots import ROBOTS
+from jaxpend.sweep import survey
 from jaxpend.terminal import console
 
 HERE = Path(__file__).parent
@@ -38,13 +44,26 @@ plant that is limited to 3 N m.
 """
 
 
-def main(folder: Path, /, keys: Count = 3, seed: Seed = 0) -> None:
+def delays(policy: Policy, task: Task, draws: int) -> list[float]:
+    """Shares of the grid of delays survived in float64, with weights changed by 1e-9 of each."""
+    grid = next(strip.values for strip in strips(task.plant) if strip.criterion == "delay")
+    rng, shares = np.random.default_rng(0), []
+    for _ in range(draws):
+        layers = tuple((w * (1 + 1e-9 * rng.normal(size=w.shape)), b) for w, b in policy.layers)
+        changed = policy.replace(layers=layers)
+        found = survey(task.plant, changed, {"delay": grid}, jax.random.key(0))
+        shares.append(float(np.mean(found.success)))
+    return shares
+
+
+def main(folder: Path, /, keys: Count = 3, seed: Seed = 0, rounding: Natural = 0) -> None:
     """Judge the published policies on both boards.
 
     Args:
         folder: data/policies/design_C.1 of the reference repository.
         keys: repetitions of what the benchmark draws; the table shows median and range.
         seed: of the first key.
+        rounding: do not judge, but print the criterion of delay for so many draws of rounding.
     """
     rows, lines = [], []
     for robot, (title, preset, place, limits) in itertools.product(ROBOTS, MODELS):
@@ -55,6 +74,11 @@ def main(folder: Path, /, keys: Count = 3, seed: Seed = 0) -> None:
             console.print(f"judging {title} of the {robot} at {limit:g} N m ...")
             task = dataclasses.replace(v2(robot).task, torque_limit=limit)
             board = dataclasses.replace(v2(robot), task=task)
+            if rounding:
+                with jax.enable_x64(True):
+                    shares = sorted(delays(policy, task, rounding))
+                console.print("delays survived: " + ", ".join(f"{share:.3f}" for share in shares))
+                continue
             row = leaderboard.judge(lambda _, it=policy: it, board, keys=keys, seed=seed)
             row |= {"robot": robot, "title": title, "preset": preset, "torque_limit": limit}
             rows.append(row | {"board_score": score, "board_robustness": robustness})
@@ -63,6 +87,8 @@ def main(folder: Path, /, keys: Count = 3, seed: Seed = 0) -> None:
             cells += [f"{robustness:.3f}", f"{row['robustness']:.3f}"]
             cells[-1] += f" ({min(draws):.3f} to {max(draws):.3f})"
             lines.append(f"| {' | '.join(cells)} |\n")
+    if rounding:
+        return
     cli.emit_json(rows, HERE / "published.json")
     write_atomically(HERE / "published.md", INTRO.format(keys=keys) + "".join(lines))
 
