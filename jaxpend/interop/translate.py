@@ -124,8 +124,8 @@ class Translator:
         return Array(array.shape, self.scalars(array)) if array.size <= SMALL else array
 
     def each(self, op: Callable[..., Node], *args: Array) -> Array:
-        """An operation entry by entry; an array without axes counts for all entries."""
-        shape = max((arg.shape for arg in args), key=len)
+        """An operation entry by entry; axes that are missing or of length 1 are repeated."""
+        shape = np.broadcast_shapes(*(arg.shape for arg in args))
         if all(arg.small for arg in args):
             parts = np.broadcast_arrays(*(arg.content for arg in args))
             entries = zip(*(part.flat for part in parts), strict=True)
@@ -134,7 +134,8 @@ class Translator:
         for arg in args:
             first = arg.content.flat[0] if arg.is_scalars else None
             same = arg.is_scalars and all(node is first for node in arg.content.flat)
-            nodes.append(first if same else self.vector(arg))
+            wide = arg if same else self.move(arg, lambda a: np.broadcast_to(a, shape))
+            nodes.append(first if same else self.vector(wide))
         found = op(*nodes)
         if found.size is None:
             return Array(shape, np.broadcast_to(np.array(found, object), shape))
