@@ -13,6 +13,7 @@ import importlib.metadata
 import json
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,7 @@ except ImportError:
 from jaxpend.interop.gymnasium import NAMES
 
 HERE = Path(__file__).parent
+NAMED = ("stable-baselines3", "gymnasium", "torch", "jax")
 SHARE = 0.5  # of the recipe's steps
 
 
@@ -98,8 +100,8 @@ def learner(robot: str, seed: int, recipe) -> SAC:
     )  # fmt: skip
 
 
-def train(robot: str, seed: int, steps: int, chunk: int, folder: Path) -> dict:
-    """One run; a row of the file."""
+def train(robot: str, seed: int, steps: int, chunk: int, folder: Path) -> Iterator[dict]:
+    """One run: its row of the file after every chunk. The best policy of all is kept."""
     recipe = load_config(TrainRun(robot=robot), "plain").sac
     env = recipe.env
     seen = models.Convention(
@@ -120,12 +122,12 @@ def train(robot: str, seed: int, steps: int, chunk: int, folder: Path) -> dict:
         if score > best:
             best, about = score, {"command": "python experiments/sb3.py", "score": score}
             save_policy(path.with_suffix(".npz"), policy, about)
-    names = ("stable-baselines3", "gymnasium", "torch", "jax")
-    return {
-        "robot": robot, "seed": seed, "steps": model.num_timesteps, "score": best, "curve": curve,
-        "seconds": round(time.time() - begun),
-        "versions": {name: importlib.metadata.version(name) for name in names},
-    }  # fmt: skip
+        yield {
+            "robot": robot, "seed": seed, "steps": model.num_timesteps, "score": best,
+            "curve": curve,
+            "seconds": round(time.time() - begun),
+            "versions": {name: importlib.metadata.version(name) for name in NAMED},
+        }  # fmt: skip
 
 
 def main() -> None:
@@ -139,11 +141,11 @@ def main() -> None:
     parser.add_argument("--chunk", type=int, default=64_000, help="steps between judgements")
     args = parser.parse_args()
     kept = HERE / "sb3.json"
-    row = train(args.robot, args.seed, args.steps, args.chunk, Path("runs/sb3"))
-    rows = json.loads(kept.read_text()) if kept.exists() else []
-    rows = [r for r in rows if (r["robot"], r["seed"]) != (args.robot, args.seed)] + [row]
-    rows.sort(key=lambda r: (r["robot"], r["seed"]))
-    write_atomically(kept, json.dumps(rows, indent=1) + "\n")
+    for row in train(args.robot, args.seed, args.steps, args.chunk, Path("runs/sb3")):
+        rows = json.loads(kept.read_text()) if kept.exists() else []
+        rows = [r for r in rows if (r["robot"], r["seed"]) != (args.robot, args.seed)] + [row]
+        rows.sort(key=lambda r: (r["robot"], r["seed"]))
+        write_atomically(kept, json.dumps(rows, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 # One thread, as the runs.
@@ -38,6 +39,7 @@ except ImportError:
     sys.exit("this needs the package rejax: pip install rejax")
 
 HERE = Path(__file__).parent
+NAMED = ("rejax", "gymnax", "jax")
 SHARE = 0.5  # of the recipe's steps: the last half brings little
 
 
@@ -86,8 +88,8 @@ def policy_of(params, env: Env) -> Policy:
     )
 
 
-def train(robot: str, seed: int, steps: int, chunk: int, path: Path) -> dict:
-    """One run; a row of the file. The best policy of all chunks is kept."""
+def train(robot: str, seed: int, steps: int, chunk: int, path: Path) -> Iterator[dict]:
+    """One run: its row of the file after every chunk. The best policy of all is kept."""
     recipe = load_config(TrainRun(robot=robot), "plain").sac
     env = Env(recipe.env, v2(robot).task)
     algorithm = SAC.create(
@@ -109,12 +111,11 @@ def train(robot: str, seed: int, steps: int, chunk: int, path: Path) -> dict:
         if score > best:
             best = score
             save_policy(path, policy, {"command": "python experiments/witness.py", "score": score})
-    names = ("rejax", "gymnax", "jax")
-    return {
-        "robot": robot, "seed": seed, "steps": k * chunk, "score": best, "curve": curve,
-        "seconds": round(time.time() - begun),
-        "versions": {name: importlib.metadata.version(name) for name in names},
-    }  # fmt: skip
+        yield {
+            "robot": robot, "seed": seed, "steps": k * chunk, "score": best, "curve": curve,
+            "seconds": round(time.time() - begun),
+            "versions": {name: importlib.metadata.version(name) for name in NAMED},
+        }  # fmt: skip
 
 
 def main() -> None:
@@ -128,11 +129,11 @@ def main() -> None:
     args = parser.parse_args()
     kept = HERE / "witness.json"
     policy = Path("runs/witness") / f"{args.robot}-seed{args.seed}.npz"
-    row = train(args.robot, args.seed, args.steps, args.chunk, policy)
-    rows = json.loads(kept.read_text()) if kept.exists() else []
-    rows = [r for r in rows if (r["robot"], r["seed"]) != (args.robot, args.seed)] + [row]
-    rows.sort(key=lambda r: (r["robot"], r["seed"]))
-    write_atomically(kept, json.dumps(rows, indent=1) + "\n")
+    for row in train(args.robot, args.seed, args.steps, args.chunk, policy):
+        rows = json.loads(kept.read_text()) if kept.exists() else []
+        rows = [r for r in rows if (r["robot"], r["seed"]) != (args.robot, args.seed)] + [row]
+        rows.sort(key=lambda r: (r["robot"], r["seed"]))
+        write_atomically(kept, json.dumps(rows, indent=1) + "\n")
 
 
 if __name__ == "__main__":
