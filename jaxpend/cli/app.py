@@ -48,7 +48,7 @@ COMMANDS = {
     ),
     "score": Command(
         "judge a controller",
-        "official v2 score of a policy, in float64",
+        "official v2 score of a policy or a recorded run, in float64",
         "--robot acrobot --policy runs/mine/policy.npz --json -",
     ),
     "robustness": Command(
@@ -60,6 +60,11 @@ COMMANDS = {
         "judge a controller",
         "every known controller on the board of a robot, next to the published rows",
         "--robot acrobot --no-robustness",
+    ),
+    "export": Command(
+        "in and out",
+        "a controller for numpy, ONNX, C or RealAIGym",
+        "runs/mine/policy.npz --to c --out policy.h",
     ),
     "runs": Command(
         "look at runs", "list runs with their state and scores", "runs --json -", computes=False

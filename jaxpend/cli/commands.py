@@ -13,6 +13,7 @@ from typing import Literal
 from ..config import GradientRun, Run, SACRun, Search, SNESRun, TrainRun
 from ..errors import JaxpendError
 from ..fields import Count, Natural, Positive, Robot, Seed
+from .exporting import export as export
 from .judging import Subject, board_of
 from .output import check_file, check_folder, emit, emit_json
 

@@ -11,7 +11,7 @@ import textwrap
 import numpy as np
 
 from ..controller import Controller
-from .program import Leaf, Node, Program, is_constant
+from .program import Leaf, Node, Program, is_constant, is_range, named
 from .trace import trace
 
 __all__ = ["source"]
@@ -80,9 +80,8 @@ def source(controller: Controller, *, class_name: str = "Controller") -> str:
 
 
 def _printed(program: Program, class_name: str) -> str:
-    nodes = program.nodes
-    names, tables = _named(nodes), _tables(nodes)
-    body = [f"{names[node]} = {_expression(node, names)}" for node in nodes if _is_step(node)]
+    names = named(program.nodes, _literal, "s{}", "{}_{}")
+    body = [f"{names[node]} = {_expression(node, names)}" for node in program.steps]
     text = "\n".join(body)
     helpers = [_helper(name, code) for name, code in HELPERS.items() if f"{name}(" in text]
     states = ", ".join(_initial(leaf) for leaf in program.state)
@@ -96,13 +95,13 @@ def _printed(program: Program, class_name: str) -> str:
     ]
     step = [f"{_tuple(unpacked)} = self._state"] if unpacked else []
     torque = ", ".join(names[node] for node in program.torque)
-    step += ["t = float(t)", "x0, x1, x2, x3 = (float(entry) for entry in x)"]
+    step += ["t = float(t)", "x_0, x_1, x_2, x_3 = (float(entry) for entry in x)"]
     step += ['with np.errstate(all="ignore"):', *(f"    {line}" for line in body)]
     step += [f"self._state = {_tuple(after)}", f"return np.array([{torque}], float)"]
     return FILE.format(
         name=program.name,
         helpers="".join(f"\n\n{helper}\n" for helper in helpers),
-        tables="".join(f"\n{table}" for table in tables),
+        tables="".join(f"\n{table}" for table in _tables(program, names)),
         class_name=class_name,
         states=f"({states},)" if states else "()",
         step=textwrap.indent("\n".join(step), " " * 8),
@@ -133,12 +132,7 @@ class {class_name}:
 '''
 
 
-def _is_step(node: Node) -> bool:
-    """Whether a node is computed in a step."""
-    return node.op not in ("constant", "state", "t", "x")
-
-
-def _number(value) -> str:
+def _number(value: np.ndarray) -> str:
     """A number as Python writes it."""
     value = value.item()
     if isinstance(value, float) and not np.isfinite(value):
@@ -146,23 +140,7 @@ def _number(value) -> str:
     return repr(value)
 
 
-def _named(nodes: list[Node]) -> dict[Node, str]:
-    """What nodes are called; scalar constants are written out."""
-    names = {}
-    for count, node in enumerate(nodes):
-        if node.op == "constant":
-            names[node] = f"C{count}" if node.size else _literal(node.value)
-        elif node.op == "state":
-            leaf, entry = node.value
-            names[node] = f"s{leaf}" if entry is None else f"s{leaf}_{entry}"
-        elif node.op in ("t", "x"):
-            names[node] = node.op if node.value is None else f"x{node.value}"
-        else:
-            names[node] = f"v{count}"
-    return names
-
-
-def _literal(value) -> str:
+def _literal(value: np.ndarray) -> str:
     text = _number(value)
     return f"({text})" if text.startswith("-") else text
 
@@ -180,13 +158,10 @@ def _initial(leaf: Leaf) -> str:
     return f"np.array([{', '.join(map(_number, leaf.initial))}])"
 
 
-def _tables(nodes: list[Node]) -> list[str]:
+def _tables(program: Program, names: dict[Node, str]) -> list[str]:
     """Vectors of numbers, and as matrices where they are factors of products."""
-    names, lines = _named(nodes), []
-    for node in nodes:
-        if node.op == "constant" and node.size and not _is_range(node):
-            lines.append(f"{names[node]} = {_array(node.value)}")
-    for node in nodes:
+    lines = [f"{names[node]} = {_array(node.value)}" for node in program.tables]
+    for node in program.steps:
         if node.op == "matmul":
             m, k, n = node.value
             for factor, shape in zip(node.args, ((m, k), (k, n)), strict=True):
@@ -208,11 +183,6 @@ def _array(values: np.ndarray) -> str:
 
 def _matrix(name: str, rows: int, columns: int) -> str:
     return f"{name}_{rows}x{columns}"
-
-
-def _is_range(node: Node) -> bool:
-    """Whether a vector is whole numbers one after the other: a slice, then, as an index."""
-    return node.kind == "int" and bool((np.diff(node.value) == 1).all())
 
 
 def _expression(node: Node, names: dict[Node, str]) -> str:
@@ -240,7 +210,7 @@ def _taken(node: Node, args: list[str]) -> str:
     index = node.args[1]
     if index.size is None:
         return f"{args[0]}.item({args[1]})"
-    if is_constant(index) and _is_range(index):
+    if is_range(index):
         first = int(index.value[0])
         return f"{args[0]}[{first}:{first + (index.size or 0)}]"
     return f"{args[0]}[{args[1]}]"

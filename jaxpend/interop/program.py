@@ -20,7 +20,17 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["FOLDS", "KINDS", "Builder", "Leaf", "Node", "Program", "is_constant", "ordered"]
+__all__ = [
+    "FOLDS",
+    "KINDS",
+    "Builder",
+    "Leaf",
+    "Node",
+    "Program",
+    "is_constant",
+    "is_range",
+    "named",
+]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -60,12 +70,26 @@ class Program:
         return tuple(node for leaf in self.next_state for node in leaf) + self.torque
 
     @property
+    def steps(self) -> list[Node]:
+        """Those of ``nodes`` that are computed: no constants and inputs."""
+        return [node for node in self.nodes if node.op not in ("constant", "state", "t", "x")]
+
+    @property
+    def tables(self) -> list[Node]:
+        """The vectors of constants that have to be written down: all but ranges to ``take``."""
+        used = [*self.outputs]
+        for node in self.steps:
+            ranged = node.op == "take" and is_range(node.args[1])
+            used += node.args[:1] if ranged else node.args
+        return list(dict.fromkeys(node for node in used if is_constant(node) and node.size))
+
+    @property
     def nodes(self) -> list[Node]:
         """All that the outputs need, in an order in which it can be computed."""
-        return ordered(self.outputs)
+        return _ordered(self.outputs)
 
 
-def ordered(outputs: Iterable[Node]) -> list[Node]:
+def _ordered(outputs: Iterable[Node]) -> list[Node]:
     """The nodes that ``outputs`` need and themselves, arguments first."""
     found: dict[int, Node] = {}
     stack = [(node, False) for node in reversed(list(outputs))]
@@ -81,9 +105,41 @@ def ordered(outputs: Iterable[Node]) -> list[Node]:
     return list(found.values())
 
 
+def named(
+    nodes: Iterable[Node], literal: Callable[[np.ndarray], str], leaf: str, entry: str
+) -> dict[Node, str]:
+    """What a printer calls nodes: scalar constants are written out, other vectors of them C1, ...
+
+    Args:
+        nodes: in order.
+        literal: writes a number.
+        leaf: the form of the name of a leaf of the state, of its number.
+        entry: of an entry, of the name of the leaf, or ``x``, and its number.
+    """
+    names = {}
+    for count, node in enumerate(nodes):
+        if node.op == "constant":
+            names[node] = literal(node.value) if node.size is None else f"C{count}"
+        elif node.op == "state":
+            number, place = node.value
+            name = leaf.format(number)
+            names[node] = name if place is None else entry.format(name, place)
+        elif node.op in ("t", "x"):
+            names[node] = "t" if node.op == "t" else entry.format("x", node.value)
+        else:
+            names[node] = f"v{count}"
+    return names
+
+
 def is_constant(node: Node, value: Any = None) -> bool:
     """Whether a node is a constant; with ``value`` whether it is that number, everywhere."""
     return node.op == "constant" and (value is None or bool(np.all(node.value == value)))
+
+
+def is_range(node: Node) -> bool:
+    """Whether it is a vector of whole numbers one after the other: a slice, then, in ``take``."""
+    whole = is_constant(node) and node.kind == "int" and node.size is not None
+    return whole and bool((np.diff(node.value) == 1).all())
 
 
 def to_int(a: Any) -> np.ndarray:

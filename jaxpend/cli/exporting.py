@@ -1,0 +1,97 @@
+"""The command ``jaxpend export``."""
+
+import re
+from pathlib import Path
+from typing import Literal
+
+from ..errors import JaxpendError
+from .output import check_file, check_folder
+
+__all__ = ["export"]
+
+MARK = b"jaxpend"  # near the start of every file that is written here
+START = 400  # bytes
+
+
+def export(policy: str, /, to: Literal["numpy", "onnx", "c", "realaigym"], out: Path) -> None:
+    """A policy or controller as a file for where there is no jax.
+
+    It holds all that the controller does in a step: observation, memory, observer and rescue.
+    A controller that loops, such as MPC, is refused.
+
+    Args:
+        policy: a policy or controller file, or acrobot or pendubot for the policy that ships with
+            the package.
+        to: numpy, a Python file with a class, in float64; onnx, a model with its memory as inputs
+            and outputs, in float32; c, a header without allocation, in float32; realaigym, a
+            submission to its boards in numpy, with what they measure, which takes a while.
+        out: file to write; for realaigym a folder, whose name the submission has.
+    """
+    if to == "realaigym":
+        return _submit(policy, out)
+    _check_out(out)
+    import jax
+
+    from ..controllers.files import load_controller
+    from ..terminal import console
+
+    with jax.enable_x64(to == "numpy"):
+        controller = load_controller(policy)
+    content = _content(controller, to, out)
+    from ..files import write_atomically
+
+    write_atomically(out, content)
+    text = f"wrote {out}, {len(content) / 1000:.0f} kB: one step of {policy}, {_use(to, out)}"
+    console.print(text, soft_wrap=True)
+
+
+def _submit(policy: str, out: Path) -> None:
+    check_folder(out)
+    from ..interop.realaigym import export
+    from ..terminal import console
+
+    found = export(policy, out)
+    scores = f"score {found['score']:.4f}, robustness {found['robustness']:.3f}"
+    text = f"wrote {out}, a submission of {policy} to RealAIGym: {scores}; see {out}/README.md"
+    console.print(text, soft_wrap=True)
+
+
+def _content(controller, to: str, out: Path) -> str | bytes:
+    if to == "numpy":
+        from ..interop.numpy import source
+
+        return source(controller)
+    if to == "c":
+        from ..interop import c
+
+        return c.source(controller, prefix=_prefix(out))
+    from ..interop.onnx import model
+
+    return model(controller).SerializeToString()
+
+
+def _prefix(out: Path) -> str:
+    """The name of a file as C can have it."""
+    name = re.sub(r"\W", "_", out.stem, flags=re.ASCII)
+    return name if name[:1].isalpha() else f"controller_{name}"
+
+
+def _use(to: str, out: Path) -> str:
+    if to == "numpy":
+        return "Controller().torque(t, x)"
+    if to == "c":
+        return f"{_prefix(out)}_init(&state) and {_prefix(out)}_step(&state, t, x, torque)"
+    return "from t, x and the state to torque and the next state"
+
+
+def _check_out(out: Path) -> None:
+    """Refuse a file that could not be written, or that is there and is no exported one."""
+    if str(out) == "-":
+        raise JaxpendError("--out is -; a controller goes to a file, not to standard output")
+    check_file(out)
+    if out.is_file():
+        with out.open("rb") as file:
+            start = file.read(START)
+        if start and MARK not in start:
+            text = f"cannot write {out}: it is there and was not exported; choose another name"
+            raise JaxpendError(text)
