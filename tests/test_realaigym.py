@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import refused, task_of
 
-from jaxpend import load_policy, rollout
+from jaxpend import cli, load_policy, rollout
 from jaxpend.boards import v2
 from jaxpend.controllers import pd
 from jaxpend.controllers.catalogue import find_controller
@@ -156,6 +156,32 @@ def test_a_file_says_its_robot(tmp_path, monkeypatch):
     torque = one.get_control_output_([0.0, 0.2, 0.0, 0.0], 0.0)
     assert torque[0] == 0 != torque[1]
     assert (tmp_path / "theirs/leaderboard/acrobot/robustness_v2/con_theirs.py").is_file()
+
+
+def test_the_command_says_where_it_is(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("jaxpend.interop.realaigym.judge", lambda *_, **__: JUDGED)
+    monkeypatch.setattr("jaxpend.terminal.console._file", None)
+    monkeypatch.chdir(tmp_path)
+    for out, words in (
+        (
+            "mine",
+            "wrote mine, a submission of acrobot to RealAIGym: score 0.6995, robustness 0.975",
+        ),
+        ("1st", "jaxpend export: the submission would be called '1st', as its folder is; a name"),
+        (
+            "mine/README.md",
+            "jaxpend export: cannot write into mine/README.md: mine/README.md is no",
+        ),
+    ):
+        line = ["jaxpend", "export", "acrobot", "--to", "realaigym", "--out", out]
+        monkeypatch.setattr("sys.argv", line)
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        assert end.value.code == (0 if words.startswith("wrote") else 2)
+        out, err = capsys.readouterr()
+        assert err.startswith(words)
+        assert (out, err.count("\n")) == ("", 1)
+    assert (tmp_path / "mine" / "README.md").is_file()
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ COMMANDS = {
     ),
     "score": Command(
         "judge a controller",
-        "official v2 score of a policy, in float64",
+        "official v2 score of a policy or a recorded run, in float64",
         "--robot acrobot --policy runs/mine/policy.npz --json -",
     ),
     "robustness": Command(
@@ -70,7 +70,7 @@ COMMANDS = {
     ),
     "export": Command(
         "in and out",
-        "a controller for numpy, ONNX or C",
+        "a controller for numpy, ONNX, C or RealAIGym",
         "runs/mine/policy.npz --to c --out policy.h",
     ),
     "runs": Command(

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from ..errors import JaxpendError
-from .output import check_file
+from .output import check_file, check_folder
 
 __all__ = ["export"]
 
@@ -13,7 +13,7 @@ MARK = b"jaxpend"  # near the start of every file that is written here
 START = 400  # bytes
 
 
-def export(policy: str, /, to: Literal["numpy", "onnx", "c"], out: Path) -> None:
+def export(policy: str, /, to: Literal["numpy", "onnx", "c", "realaigym"], out: Path) -> None:
     """A policy or controller as a file for where there is no jax.
 
     It holds all that the controller does in a step: observation, memory, observer and rescue.
@@ -23,9 +23,12 @@ def export(policy: str, /, to: Literal["numpy", "onnx", "c"], out: Path) -> None
         policy: a policy or controller file, or acrobot or pendubot for the policy that ships with
             the package.
         to: numpy, a Python file with a class, in float64; onnx, a model with its memory as inputs
-            and outputs, in float32; c, a header without allocation, in float32.
-        out: file to write.
+            and outputs, in float32; c, a header without allocation, in float32; realaigym, a
+            submission to its boards in numpy, with what they measure, which takes a while.
+        out: file to write; for realaigym a folder, whose name the submission has.
     """
+    if to == "realaigym":
+        return _submit(policy, out)
     _check_out(out)
     import jax
 
@@ -39,6 +42,17 @@ def export(policy: str, /, to: Literal["numpy", "onnx", "c"], out: Path) -> None
 
     write_atomically(out, content)
     text = f"wrote {out}, {len(content) / 1000:.0f} kB: one step of {policy}, {_use(to, out)}"
+    console.print(text, soft_wrap=True)
+
+
+def _submit(policy: str, out: Path) -> None:
+    check_folder(out)
+    from ..interop.realaigym import export
+    from ..terminal import console
+
+    found = export(policy, out)
+    scores = f"score {found['score']:.4f}, robustness {found['robustness']:.3f}"
+    text = f"wrote {out}, a submission of {policy} to RealAIGym: {scores}; see {out}/README.md"
     console.print(text, soft_wrap=True)
 
 
