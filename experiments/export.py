@@ -7,6 +7,7 @@ gcc -O2 for C, ONNX Runtime with one thread, and jax compiled on the CPU in a lo
 """
 
 import ctypes
+import itertools
 import subprocess
 import tempfile
 import time
@@ -43,7 +44,7 @@ def with_history() -> Policy:
     sizes = (observation.size, 64, 64, 1)
     layers = tuple(
         (jnp.asarray(draw.normal(size=(a, b)) / a**0.5), jnp.asarray(draw.normal(size=b)))
-        for a, b in zip(sizes[:-1], sizes[1:], strict=True)
+        for a, b in itertools.pairwise(sizes)
     )
     return Policy(layers, jnp.asarray(3.0), observation=observation)
 
