@@ -14,6 +14,7 @@ On the same measurements, in float64, the torques are those of the controller to
 in float32 they differ by rounding, as much as those of ``interop.c``.
 """
 
+import hashlib
 from typing import Any
 
 import numpy as np
@@ -100,9 +101,10 @@ class _Graph:
             else:
                 self.put("Identity", [self.name(after[0])], name=f"next_s{number}")
         outputs.insert(0, info("torque", floats, [2]))
-        graph = self.helper.make_graph(
-            self.nodes, "controller", inputs, outputs, list(self.initializers.values())
-        )
+        # Of a constant that a product reads as a matrix the flat form is not used.
+        used = {name for node in self.nodes for name in node.input} | {i.name for i in inputs}
+        initial = [tensor for name, tensor in self.initializers.items() if name in used]
+        graph = self.helper.make_graph(self.nodes, "controller", inputs, outputs, initial)
         about = f"The controller {self.program.name}; see jaxpend.interop.onnx."
         return self.helper.make_model(
             graph, producer_name="jaxpend", doc_string=about, ir_version=IR,
@@ -122,7 +124,7 @@ class _Graph:
         form = "x".join(map(str, array.shape)) or "scalar"
         name = f"{kind}_{form}_{array.tobytes().hex()}"
         if len(name) > 60:
-            name = f"table{len(self.initializers)}"
+            name = f"table_{hashlib.sha256(name.encode()).hexdigest()[:16]}"
         return name if name in self.initializers else self.initial(name, array)
 
     def name(self, node: Node) -> str:
