@@ -7,6 +7,7 @@ gcc -O2 for C, ONNX Runtime with one thread, and jax compiled on the CPU in a lo
 """
 
 import ctypes
+import itertools
 import subprocess
 import tempfile
 import time
@@ -43,7 +44,7 @@ def with_history() -> Policy:
     sizes = (observation.size, 64, 64, 1)
     layers = tuple(
         (jnp.asarray(draw.normal(size=(a, b)) / a**0.5), jnp.asarray(draw.normal(size=b)))
-        for a, b in zip(sizes[:-1], sizes[1:], strict=True)
+        for a, b in itertools.pairwise(sizes)
     )
     return Policy(layers, jnp.asarray(3.0), observation=observation)
 
@@ -58,17 +59,20 @@ CONTROLLERS = {
 }
 
 
-@jax.jit
 def again(controller, times, states):
-    """Torques (N, 2) of the controller itself for measurements (N, 4)."""
-    start = controller.reset(jax.random.key(0))
-    return jax.lax.scan(lambda carry, now: controller(carry, *now), start, (times, states))[1]
+    """Torques (N, 2) of the controller itself, compiled once more with its arrays as constants."""
+
+    def run(now):
+        start = controller.reset(jax.random.key(0))
+        return jax.lax.scan(lambda carry, now: controller(carry, *now), start, now)[1]
+
+    return jax.jit(run)((times, states))
 
 
 def in_c(controller, times, states):
     """Torques (N, 2), and ns a step."""
     pointer = ctypes.POINTER(ctypes.c_float)
-    arrays = [np.ascontiguousarray(a, "f4") for a in (times, states, np.empty((len(times), 2)))]
+    arrays = [np.ascontiguousarray(a, "f4") for a in (times, states, np.zeros((len(times), 2)))]
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "controller.h").write_text(c.source(controller))
         (Path(folder) / "main.c").write_text(MAIN)
