@@ -59,17 +59,20 @@ CONTROLLERS = {
 }
 
 
-@jax.jit
 def again(controller, times, states):
-    """Torques (N, 2) of the controller itself for measurements (N, 4)."""
-    start = controller.reset(jax.random.key(0))
-    return jax.lax.scan(lambda carry, now: controller(carry, *now), start, (times, states))[1]
+    """Torques (N, 2) of the controller itself, compiled once more with its arrays as constants."""
+
+    def run(now):
+        start = controller.reset(jax.random.key(0))
+        return jax.lax.scan(lambda carry, now: controller(carry, *now), start, now)[1]
+
+    return jax.jit(run)((times, states))
 
 
 def in_c(controller, times, states):
     """Torques (N, 2), and ns a step."""
     pointer = ctypes.POINTER(ctypes.c_float)
-    arrays = [np.ascontiguousarray(a, "f4") for a in (times, states, np.empty((len(times), 2)))]
+    arrays = [np.ascontiguousarray(a, "f4") for a in (times, states, np.zeros((len(times), 2)))]
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "controller.h").write_text(c.source(controller))
         (Path(folder) / "main.c").write_text(MAIN)

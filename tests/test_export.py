@@ -14,6 +14,7 @@ import pytest
 from conftest import refused, task_of
 
 from jaxpend import cli, load_policy, rollout
+from jaxpend.config import ACTIVATIONS
 from jaxpend.controller import Feedback
 from jaxpend.controllers.callback import PythonLaw
 from jaxpend.controllers.catalogue import build
@@ -23,7 +24,7 @@ from jaxpend.controllers.policy import Policy
 from jaxpend.interop import c as to_c
 from jaxpend.interop import numpy as to_numpy
 from jaxpend.interop import onnx as to_onnx
-from jaxpend.observation import Observation
+from jaxpend.observation import KINDS, Observation
 from jaxpend.pytree import Pytree, pytree
 from jaxpend.scenario import Scenario
 
@@ -31,9 +32,9 @@ STARTS = np.array([[0, 0, 0, 0], [2.0, -1.0, 3.0, -4.0]])
 NAMES = ("plain", "history", "shipped", "guarded history")
 
 
-def policy(history):
+def policy(history, observation=None):
     """A network with random weights, and where it sees the past one of its own memory."""
-    observation = Observation(history=history)
+    observation = observation or Observation(history=history)
     draw = np.random.default_rng(history)
     sizes = (observation.size, 24, 1)
     normal = [(draw.normal(size=n), draw.normal(size=n[1])) for n in itertools.pairwise(sizes)]
@@ -200,6 +201,21 @@ def test_what_looks_up_tables_or_uses_time_is_exported_too(name):
     np.testing.assert_allclose(torques, expected, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_policies_may_see_and_have_is_exported(kind):
+    """Every kind of observation, with another activation each."""
+    activation = ACTIVATIONS[list(KINDS).index(kind) % len(ACTIVATIONS)]
+    draw = np.random.default_rng(2)
+    states = draw.normal(size=(60, 4)) * np.array([5, 5, 40, 40])
+    with jax.enable_x64(True):
+        found = policy(0, Observation(kind=kind)).replace(activation=activation)
+        expected = np.asarray(again(found, np.arange(60.0), states[None])[0])
+        names: dict = {}
+        exec(to_numpy.source(found), names)
+    torques = replayed(names["Controller"](), np.arange(60.0), states)
+    np.testing.assert_allclose(torques, expected, rtol=0, atol=1e-12)
+
+
 def everything(t, x):
     """Torques that use most of what can be printed, on scalars and on vectors."""
     wide = jnp.outer(jnp.arange(1.0, 9.0), x)  # (8, 4)
@@ -276,6 +292,8 @@ def test_what_cannot_be_printed_is_refused_in_one_sentence():
         to_numpy.source(PythonLaw(lambda t, x: np.zeros(2)))
     with refused("Feedback cannot be exported: it uses the operation sort"):
         to_numpy.source(Feedback(lambda t, x: jnp.sort(x)[:2]))
+    with refused("the class name 'a b' is no name in Python"):
+        to_numpy.source(policy(0), class_name="a b")
     with refused("the prefix '1x' is no name in C"):
         to_c.source(Dice(), prefix="1x")
 

@@ -6,11 +6,13 @@ jax: nothing raises. On the same measurements the torques are those of the contr
 to about 1e-12 N m, also of a guarded one in a closed loop of 10 s, which multiplies rounding.
 """
 
+import keyword
 import textwrap
 
 import numpy as np
 
 from ..controller import Controller
+from ..errors import JaxpendError
 from .program import Leaf, Node, Program, is_constant, is_range, named
 from .trace import trace
 
@@ -74,8 +76,10 @@ def source(controller: Controller, *, class_name: str = "Controller") -> str:
         class_name: an identifier.
 
     Raises:
-        JaxpendError: as ``trace.trace``.
+        JaxpendError: as ``trace.trace``, or a name that Python cannot have.
     """
+    if not class_name.isidentifier() or keyword.iskeyword(class_name):
+        raise JaxpendError(f"the class name {class_name!r} is no name in Python; use letters")
     return _printed(trace(controller, "float64"), class_name)
 
 
