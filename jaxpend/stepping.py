@@ -49,9 +49,8 @@ def _of_type(controller: Any, dtype: Any) -> Any:
     def cast(leaf: Any) -> jax.Array:
         known = jnp.result_type(leaf)
         wanted = dtype if jnp.issubdtype(known, jnp.floating) else known
-        return (
-            leaf if isinstance(leaf, jax.Array) and known == wanted else jnp.asarray(leaf, wanted)
-        )
+        fits = isinstance(leaf, jax.Array) and known == wanted
+        return leaf if fits and not getattr(leaf, "weak_type", False) else jnp.asarray(leaf, wanted)
 
     return jax.tree.map(cast, controller)
 
