@@ -25,7 +25,7 @@ from jaxpend.score import official
 HERE = Path(__file__).parent
 ROBOTS = ("acrobot", "pendubot")
 STAGES = ("sac", "gradient", "snes")
-# What a recipe changes of the robot's own; "plain" has a file of its own.
+# What a recipe changes of the robot's own; "plain" and "learned" have files of their own.
 RECIPES = {
     "shipped": [],
     "no pulses": ["--sac.demonstrations.pulses", "0"],
@@ -40,6 +40,7 @@ RECIPES = {
         "--snes.scenarios", "16", "--snes.objective.weight", "0.5", "--snes.generations", "60",
     ],
     "plain": [],
+    "learned": [],
 }  # fmt: skip
 # What is taken from the policy that the shipped recipe ended with; nothing is trained again.
 TAKEN = {
@@ -81,7 +82,7 @@ def train(recipe: str, robot: str, seed: int, runs: Path, flags: Sequence[str] =
     folder = folder_of(recipe, robot, seed, runs)
     if not (folder / "result.json").exists():
         # Relative: the command goes into the policy files.
-        config = "plain" if recipe == "plain" else robot
+        config = {"plain": "plain", "learned": f"learned_{robot}"}.get(recipe, robot)
         command = [sys.executable, "-m", "jaxpend.train", "--config", config]
         command += ["--robot", robot, "--seed", str(seed)]
         command += ["--runs", str(runs), "--run", folder.name]
@@ -98,7 +99,7 @@ def train(recipe: str, robot: str, seed: int, runs: Path, flags: Sequence[str] =
         "recipe": recipe,
         "robot": robot,
         "seed": seed,
-        "imitation": None if recipe == "plain" else first["score"],
+        "imitation": None if recipe in ("plain", "learned") else first["score"],
         **{n: {k: result[n][k] for k in keys} for n in STAGES if n in result},
         "criteria": result["snes"]["criteria"],
         "robustness": robustness(robot, folder / "policy.npz"),

@@ -20,6 +20,7 @@ import jaxpend
 from jaxpend import JaxpendError, __version__, cli, designs
 from jaxpend.cli import cache, commands
 from jaxpend.config import TrainRun
+from jaxpend.config_files import recipes
 from jaxpend.fields import Count
 from jaxpend.train.interrupt import Stopped
 
@@ -149,7 +150,7 @@ def test_what_is_wrong_on_the_command_line_is_one_sentence(monkeypatch, capsys, 
         ("--sac.env.dt inf", "--sac.env.dt is inf; it must be finite"),
         ("--sac.target-entropy nan", "--sac.target_entropy is nan; it must be a number"),
         ("--sac.env.robot acrobot", "unknown option --sac.env.robot; did you mean --sac.env.dt?"),
-        ("--sac.replay-capacity 8", "--sac.replay_capacity is 8; it must hold at least one step of "
+        ("--sac.replay-capacity 8", "--sac.replay_capacity is 8; it must hold n_step = 1 steps of "
          "all 32 environments"),
         ("--seed -1", "--seed is -1; it must not be negative"),
         ("--seed 2147483647", "--seed is 2147483647; it must be below 2,147,483,647"),
@@ -158,10 +159,10 @@ def test_what_is_wrong_on_the_command_line_is_one_sentence(monkeypatch, capsys, 
         ("--plant a.yaml --design C.1/1.0", "--plant and design are both given; a run has one of "
          "them"),
         ("--conf x", "unknown option --conf; did you mean --config?"),
-        ("--config", "--config needs a YAML file, or a recipe: acrobot, pendubot, plain"),
-        ("--config --seed 3", "--config needs a YAML file, or a recipe: acrobot, pendubot, plain"),
-        ("--config nothing", "there is no configuration file nothing, and no such recipe: acrobot, "
-         "pendubot, plain"),
+        ("--config", f"--config needs a YAML file, or a recipe: {', '.join(recipes())}"),
+        ("--config --seed 3", f"--config needs a YAML file, or a recipe: {', '.join(recipes())}"),
+        ("--config nothing", "there is no configuration file nothing, and no such recipe: "
+         f"{', '.join(recipes())}"),
         ("--sac.steps 0", "--sac.steps is 0; it must be positive"),
     ],
 )  # fmt: skip
