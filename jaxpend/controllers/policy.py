@@ -31,8 +31,7 @@ class Memory(Pytree):
     """The calls of a policy so far, the newest first; as many as its history may need."""
 
     x: jax.Array  # (N, 4) measured states
-    actions: jax.Array  # (N,) sum of the actions of all calls before that one
-    total: jax.Array  # () sum of the actions of all calls
+    actions: jax.Array  # (N,) in them
     t: jax.Array  # () s, of the last call; -inf before the first
 
     def past(self, history: int, period: float, t: jax.Array, x: jax.Array) -> jax.Array:
@@ -48,15 +47,15 @@ class Memory(Pytree):
         calls = jnp.clip(calls, 1, len(self.x) // history)
         ago = jnp.arange(1, history + 1) * calls - 1
         states = jnp.where(jnp.isfinite(self.t), self.x[ago], x)
-        sums = jnp.append(self.total, self.actions[ago])
-        return jnp.column_stack([states, (sums[:-1] - sums[1:]) / calls])
+        sums = jnp.append(0.0, jnp.cumsum(self.actions)[ago]).astype(self.actions.dtype)
+        return jnp.column_stack([states, (sums[1:] - sums[:-1]) / calls])
 
     def after(self, t: jax.Array, x: jax.Array, action: jax.Array) -> "Memory":
         """With a call at time ``t`` in state ``x`` that acted so."""
         states = jnp.concatenate([x[None], self.x[:-1]])
         states = jnp.where(jnp.isfinite(self.t), states, x)  # the first state was there before
-        sums = jnp.append(self.total, self.actions[:-1])
-        return Memory(states, sums, self.total + action, jnp.asarray(t, self.t.dtype))
+        actions = jnp.append(action, self.actions[:-1]).astype(self.actions.dtype)
+        return Memory(states, actions, jnp.asarray(t, self.t.dtype))
 
 
 @pytree
@@ -96,8 +95,8 @@ class Policy(Startable):
         memory, dtype = None, jnp.result_type(float)
         if history := self.observation.history:
             calls = history * max(round(self.control_dt / FASTEST), 1)
-            states, zero = jnp.zeros((calls, 4), dtype), jnp.zeros((), dtype)
-            memory = Memory(states, jnp.zeros(calls, dtype), zero, zero - jnp.inf)
+            states, never = jnp.zeros((calls, 4), dtype), jnp.asarray(-jnp.inf, dtype)
+            memory = Memory(states, jnp.zeros(calls, dtype), never)
         return None if self.action_noise is None else key, memory
 
     def look(self, carry, t: jax.Array, x: jax.Array) -> jax.Array:

@@ -1,16 +1,16 @@
-"""A controller as one C header, in float32: no allocation, no loops of unknown length.
+"""A controller as one C header: no allocation, no loops of unknown length.
 
 It is C99 and needs of the C library sinf, cosf, tanhf and expf, as far as the controller uses
 them (and sqrtf or logf for a controller of your own that has them). Compile it without
 -ffast-math: it relies on numbers that are not finite, and on exact differences in the remainder
 of angles.
 
-How close it is, on the same measurements: a policy alone differs from jax in float32 by 1e-5 N m,
-and one with a history by 1e-4, since it takes differences of a sum of all actions. An observer
-multiplies the rounding of an angle (2e-7 rad) by the rate of its calls, and with that a guarded
-policy differs by up to 3e-3 N m: as much as jax does in float32 from one compilation to the next.
-A loop that is closed in float32 drifts apart while it swings up, because the motion multiplies
-rounding too; ``interop.numpy``, in float64, does not. ``experiments/export.py`` measures it.
+How close it is, on the same measurements: in float64 a torque differs from that of jax by less
+than 1e-9 N m, whatever the controller. In float32 a policy, with a history or without, differs by
+some 1e-5 N m. An observer multiplies the rounding of an angle (2e-7 rad) by the rate of its calls,
+and with that a guarded policy differs by up to 3e-3 N m: as much as jax does in float32 from one
+compilation to the next. A loop that is closed in float32 drifts apart while it swings up, because
+the motion multiplies rounding too. ``experiments/export.py`` measures it.
 """
 
 import re
@@ -126,7 +126,13 @@ static inline void {p}_step({p}_state *s, float t, const float x[4], float torqu
 LOOP = "for (int i = 0; i < {}; ++i) "
 
 
-def source(controller: Controller, *, prefix: str = "controller") -> str:
+# The limits of ``HELPERS`` that hang on the precision, in double.
+LIMITS = {"8388608.0": "2147483648.0", "4097.0": "134217729.0"}
+
+
+def source(
+    controller: Controller, *, prefix: str = "controller", precision: str = "float32"
+) -> str:
     """The text of a C header with ``PREFIX_state``, ``PREFIX_init`` and ``PREFIX_step``.
 
     A step is called as often as the controller is, every 0.002 s for a guarded one. Policies act
@@ -135,13 +141,24 @@ def source(controller: Controller, *, prefix: str = "controller") -> str:
     Args:
         controller: any that can be traced.
         prefix: of the names, an identifier.
+        precision: "float32", or "float64" for a header that computes in double.
 
     Raises:
-        JaxpendError: as ``trace.trace``, or a prefix that is no identifier of C.
+        JaxpendError: as ``trace.trace``, an unknown precision, or a prefix that is no identifier
+            of C.
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", prefix):
         raise JaxpendError(f"the prefix {prefix!r} is no name in C; use letters, digits and _")
-    return _printed(trace(controller, "float32"), prefix)
+    text = _printed(trace(controller, precision), prefix)
+    return text if precision == "float32" else _in_double(text)
+
+
+def _in_double(text: str) -> str:
+    """A header that was printed for float, with the type, functions and limits of double."""
+    text = re.sub(r"\bfloat\b", "double", text)
+    text = re.sub(rf"\b({'|'.join(FUNCTIONS)})f\(", r"\1(", text)
+    text = re.sub(r"\b(\d+\.\d*(?:e[+-]?\d+)?|\d+e[+-]?\d+)f\b", r"\1", text)
+    return re.sub("|".join(map(re.escape, LIMITS)), lambda found: LIMITS[found[0]], text)
 
 
 def _printed(program: Program, prefix: str) -> str:
@@ -183,7 +200,7 @@ def _literal(value: np.ndarray) -> str:
     if isinstance(number, float):
         if not np.isfinite(number):
             return "NAN" if number != number else f"({'-' if number < 0 else ''}INFINITY)"
-        text = str(np.float32(number))
+        text = str(value.dtype.type(number))
         text = f"{text}f" if "." in text or "e" in text else f"{text}.0f"
         return f"({text})" if text.startswith("-") else text
     return f"({int(number)})" if number < 0 else str(int(number))

@@ -20,14 +20,13 @@ from typing import Any
 import numpy as np
 
 from ..controller import Controller
-from ..errors import JaxpendError, choose
+from ..errors import JaxpendError
 from .program import Node, Program, is_constant
 from .trace import trace
 
 __all__ = ["model"]
 
 OPSET, IR = 18, 9  # of 2022 and 2023: what is not brand-new reads them
-PRECISIONS = ("float32", "float64")
 OPERATORS = {
     "add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "neg": "Neg", "abs": "Abs",
     "max": "Max", "min": "Min", "sign": "Sign", "floor": "Floor", "ceil": "Ceil",
@@ -50,7 +49,6 @@ def model(controller: Controller, *, precision: str = "float32") -> Any:
     Raises:
         JaxpendError: as ``trace.trace``, or onnx is not installed.
     """
-    choose("precision", precision, PRECISIONS)
     try:
         import onnx
     except ImportError:

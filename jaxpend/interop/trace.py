@@ -8,13 +8,14 @@ import numpy as np
 
 from ..controller import Controller, check_controller
 from ..controllers.policy import change_policies
-from ..errors import THEIRS, JaxpendError, blame
+from ..errors import THEIRS, JaxpendError, blame, choose
 from .program import KINDS, Builder, Leaf, Node, Program
 from .rules import RULES
 from .translate import SMALL, Array, Translator
 
 __all__ = ["trace"]
 
+PRECISIONS = ("float32", "float64")
 MOST = 20_000  # nodes; a guarded policy has about 700
 
 
@@ -29,9 +30,10 @@ def trace(controller: Controller, precision: str) -> Program:
         precision: "float32" or "float64".
 
     Raises:
-        JaxpendError: what is no controller, or one that loops, draws random numbers, calls Python
-            or uses another operation that cannot be printed.
+        JaxpendError: an unknown precision, what is no controller, or one that loops, draws random
+            numbers, calls Python or uses another operation that cannot be printed.
     """
+    choose("precision", precision, PRECISIONS)
     check_controller(controller)
     controller, _ = change_policies(controller, lambda policy: policy.replace(action_noise=None))
     name = type(controller).__name__
