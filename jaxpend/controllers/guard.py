@@ -25,7 +25,6 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from ..controller import Controller, check_controller, check_robot
 from ..criteria import upright
@@ -58,6 +57,42 @@ FORGETTING = 0.1  # s, the time over which noise is averaged
 
 
 @pytree
+class Covariance(Pytree):
+    """Of the errors of angle a, velocity v and unexplained acceleration d of both joints."""
+
+    aa: jax.Array  # (2,) rad^2, as all others in SI units
+    av: jax.Array
+    ad: jax.Array
+    vv: jax.Array
+    vd: jax.Array
+    dd: jax.Array
+
+    def ahead(self, dt: float, wandering: jax.Array) -> "Covariance":
+        """One call later: F P F' + Q, F being motion at constant acceleration, Q of d alone."""
+        h = 0.5 * dt**2
+        # Entries of F P, by row and column.
+        aa = self.aa + dt * self.av + h * self.ad
+        av = self.av + dt * self.vv + h * self.vd
+        ad = self.ad + dt * self.vd + h * self.dd
+        vv, vd = self.vv + dt * self.vd, self.vd + dt * self.dd
+        dd = self.dd + wandering
+        return Covariance(aa + dt * av + h * ad, av + dt * ad, ad, vv + dt * vd, vd, dd)
+
+    def corrected(self, column: tuple, variance: jax.Array, noise: jax.Array):
+        """Gains of a measured value and P after it: P - k p', k = p / (variance + noise).
+
+        ``column`` p are the covariances of a, v and d with the value, ``variance`` is its own.
+        """
+        gain = tuple(entry / (variance + noise) for entry in column)
+        (ka, kv, kd), (a, v, d) = gain, column
+        after = Covariance(
+            self.aa - ka * a, self.av - ka * v, self.ad - ka * d,
+            self.vv - kv * v, self.vd - kv * d, self.dd - kd * d,
+        )  # fmt: skip
+        return gain, after
+
+
+@pytree
 class Seen(Pytree):
     """What a Kalman filter knows; the last axis of (..., 2) is the joint."""
 
@@ -65,7 +100,7 @@ class Seen(Pytree):
     x: jax.Array  # (4,) estimated state
     d: jax.Array  # (2,) rad/s^2, acceleration that the model does not explain
     torque: jax.Array  # (2,) N m, applied since
-    covariance: jax.Array  # (3, 3, 2) of the errors of angle, velocity and d
+    covariance: Covariance
     innovation: jax.Array  # (2, 2) the last one, of angles and of velocities
     change: jax.Array  # (2, 2) its mean squared change
 
@@ -82,15 +117,10 @@ class KalmanFilter(Pytree):
     def reset(self) -> Seen:
         """Memory before the first measurement."""
         two, four = jnp.zeros((2, 2)), jnp.zeros(4)
-        spread = jnp.stack([self.least[0] ** 2, jnp.ones(()), FORGETTING * self.disturbance**2])
-        covariance = jnp.eye(3)[..., None] * jnp.broadcast_to(spread[:, None, None], (3, 1, 2))
-        return Seen(jnp.array(False), four, four[:2], four[:2], covariance, two, two)
-
-    def _shifted(self, rows: jax.Array) -> jax.Array:
-        """Angle, velocity and acceleration (3, ...) one call later."""
-        dt = self.dt
-        angle = rows[0] + dt * rows[1] + 0.5 * dt**2 * rows[2]
-        return jnp.stack([angle, rows[1] + dt * rows[2], rows[2]])
+        none = four[:2]
+        angle, d = none + self.least[0] ** 2, none + FORGETTING * self.disturbance**2
+        covariance = Covariance(angle, none, none, none + 1.0, none, d)
+        return Seen(jnp.array(False), four, none, none, covariance, two, two)
 
     def __call__(self, memory: Seen, measured: jax.Array) -> tuple[Seen, jax.Array]:
         """New memory and estimated state (4,), at first the measured one, of a measurement (4,)."""
@@ -102,25 +132,23 @@ class KalmanFilter(Pytree):
         change = memory.change + (change - memory.change) * self.dt / FORGETTING
         noise = jnp.maximum(0.5 * change, (self.least**2)[:, None])
 
-        # P = F P F' + Q, in which the shift by F is applied to rows and to columns.
-        p = self._shifted(self._shifted(memory.covariance).swapaxes(0, 1))
-        p = p + self.disturbance**2 * self.dt * np.diag([0.0, 0.0, 1.0])[..., None]
-        correction = jnp.zeros((3, 2))
-        for i in range(2):  # one measured value after the other, so that nothing is inverted
-            gain = p[:, i] / (p[i, i] + noise[i])
-            correction = correction + gain * (innovation[i] - correction[i])
-            p = p - gain[:, None] * p[i]
+        # One measured value after the other, so that nothing is inverted.
+        p = memory.covariance.ahead(self.dt, self.disturbance**2 * self.dt)
+        first, p = p.corrected((p.aa, p.av, p.ad), p.aa, noise[0])
+        second, p = p.corrected((p.av, p.vv, p.vd), p.vv, noise[1])
+        left = innovation[1] - first[1] * innovation[0]
+        a, v, d = (k * innovation[0] + then * left for k, then in zip(first, second, strict=True))
 
-        estimate = jnp.where(started, ahead + correction[:2].reshape(4), measured).astype(dtype)
-        true, d, torque = jnp.array(True), memory.d + correction[2], memory.torque
+        estimate = jnp.where(started, ahead + jnp.concatenate([a, v]), measured).astype(dtype)
+        true, d, torque = jnp.array(True), memory.d + d, memory.torque
         after = Seen(true, estimate, d, torque, p, innovation, change)
         # The first measurement has nothing that it could be compared with.
-        first = memory.replace(started=true, x=estimate)
+        begun = memory.replace(started=true, x=estimate)
 
         def chosen(new, old):
             return jnp.where(started, new, old).astype(old.dtype)
 
-        return jax.tree.map(chosen, after, first), estimate
+        return jax.tree.map(chosen, after, begun), estimate
 
     def applied(self, memory: Seen, torque: jax.Array) -> Seen:
         """Memory that knows the torque (2,), N m, asked for since the last estimate."""
