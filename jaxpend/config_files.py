@@ -89,6 +89,8 @@ def read_yaml(path: Any) -> Any:
     import yaml  # only users with files of their own pay for it
 
     try:
+        if isinstance(path, Path) and path.is_char_device():  # /dev/zero has no end
+            raise ValueError
         return yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise JaxpendError(f"cannot read {path}: {error.strerror or error}") from None

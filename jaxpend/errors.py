@@ -31,5 +31,5 @@ def blame(error: BaseException) -> str:
             at = f" at {frame.filename}:{frame.lineno}"
     said = (str(error).strip() or "no message").splitlines()[0]
     if isinstance(error, SyntaxError):  # there is no frame of code that was never run
-        said, at = error.msg, f" at {error.filename}:{error.lineno}"
+        said, at = error.msg, f" at {error.filename}:{error.lineno}" if error.filename else ""
     return f"{type(error).__name__}: {said}{at}"

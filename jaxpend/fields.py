@@ -33,6 +33,7 @@ __all__ = [
     "NotNegative",
     "Positive",
     "Robot",
+    "Scale",
     "Seed",
     "Share",
     "checked",
@@ -75,6 +76,8 @@ Count = Annotated[int, Bounds(above=0)]
 Natural = Annotated[int, Bounds(least=0)]
 Positive = Annotated[float, Bounds(above=0)]
 NotNegative = Annotated[float, Bounds(least=0)]
+# Of what is multiplied with float32 numbers, which would be infinite or 0 where it is beyond them.
+Scale = Annotated[float, Bounds(above=0, least=1e-9, most=1e9)]
 Share = Annotated[float, Bounds(least=0, most=1)]
 # Keys of jax are made of 32 bits; the largest seed is for scenarios that no run trains on.
 Seed = Annotated[int, Bounds(least=0, below=LARGEST)]

@@ -213,7 +213,9 @@ _watched = jax.jit(retained, static_argnames=("config", "task"))
 def _check_retention(controller: Controller) -> None:
     if not isinstance(controller, Policy):
         text = "it needs a policy without a guard, and not"
-        raise JaxpendError(f"retention keeps actions of a network; {text} {controller!r:.40}")
+        raise JaxpendError(
+            f"retention keeps actions of a network; {text} {type(controller).__name__}"
+        )
 
 
 @partial(jax.jit, static_argnames=("config", "steps", "task"))

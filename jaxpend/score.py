@@ -152,7 +152,7 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
     t, u = np.asarray(run.t, float), np.asarray(run.u, float)
     if (last := float(t[-1])) > 1.01 * task.duration:
         raise JaxpendError(
-            f"the run lasts {last:.3f} s; a run of this board lasts {task.duration:g}"
+            f"the run lasts {last:.7g} s; a run of this board lasts {task.duration:g}"
         )
     steps = np.diff(t)
     worst = int(np.argmax(abs(steps - task.dt)))

@@ -8,8 +8,9 @@ from conftest import refused, task_of
 
 from jaxpend import rollout
 from jaxpend.controller import check_controller
-from jaxpend.controllers.callback import is_realaigym, realaigym
+from jaxpend.controllers.callback import PythonLaw, is_realaigym, realaigym
 from jaxpend.controllers.catalogue import find_controller
+from jaxpend.errors import JaxpendError
 from jaxpend.pytree import pytree
 from jaxpend.scenario import Scenario
 from jaxpend.sweep import sweep
@@ -126,3 +127,12 @@ class Uncopied(Wrong):
 def test_an_object_that_cannot_be_copied_is_refused():
     with refused("Uncopied cannot be copied, and every run needs its own: TypeError: cannot pi"):
         check_controller(realaigym(Uncopied()))
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_a_torque_that_is_complex_or_too_large_is_refused_without_a_warning(batched):
+    shape = (1, 2) if batched else 2
+    with pytest.raises(JaxpendError, match="complex; it must be real"):
+        PythonLaw(lambda t, x: np.full(shape, 1j), batched=batched).check()
+    with pytest.raises(JaxpendError, match="not finite"):
+        PythonLaw(lambda t, x: np.full(shape, 1e300), batched=batched).check()

@@ -96,6 +96,7 @@ ROW = "0,0,0,0,0,0,0\n"
         (HEADER + "\n" + 2 * ROW, "holds 2 samples"),
         (HEADER.replace("time,", "") + "\n" + 9 * ROW, "has no column time; it must have the col"),
         (HEADER.replace("vel_meas2,", "") + "\n", "has no column vel_meas2; it must"),
+        (HEADER + ",vel_meas1\n", "has the column vel_meas1 twice; which one counts is not clear"),
         ("time,pos1,pos2,vel1,vel2,tau1\n", "has no column tau2; it must"),
         ("0,1,2\n3,4,5\n", "has no column time, pos_meas1, pos_meas2, vel_meas1"),
         (HEADER + "\n" + ROW + "0,0,0\n" + ROW, "line 3 has 3 values for 7 columns; it may be cut"),
@@ -129,7 +130,8 @@ def grid(**changes):
     [
         (grid(t=0.001 * np.arange(5000)), True, "has a step of 0.001 s; a simulated run of this"),
         (grid(t=1 + 0.001 * np.arange(5000)), True, "the run starts at 1 s and has"),
-        (grid(t=0.01 * np.arange(5000)), False, "the run lasts 49.990 s; a run of this board last"),
+        (grid(t=1e300 * np.arange(5000)), False, "the run lasts 4.999e+303 s; a run of this boa"),
+        (grid(t=0.01 * np.arange(5000)), False, "the run lasts 49.99 s; a run of this board last"),
         (grid(u=np.ones((5000, 2))), True, "joint 2 has torques of up to 1 N m, but the pendubot"),
         (grid(u=np.tile([0.2, 3.0], (5000, 1))), False, "driven at joint 1; the run is that of an"),
     ],

@@ -182,7 +182,7 @@ def test_retention_is_of_a_policy_alone():
     config = GradientConfig(retention=1.0)
     with refused("it needs a policy without a guard"):
         gradient.init(config, energy_shaping(designs.competition("acrobot"), "acrobot"), KEY)
-    with refused("it needs a policy without a guard"):
+    with refused("it needs a policy without a guard, and not Guarded"):
         gradient.Gradient(config, guard(shipped_network(), "pendubot"), TASK)
 
 

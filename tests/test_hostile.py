@@ -314,3 +314,77 @@ def test_a_plant_may_have_numbers_as_yaml_has_them(tmp_path):
 def test_a_leaderboard_goes_to_standard_output(capsys):
     cli.commands.emit("| a |\n", "-")
     assert capsys.readouterr().out == "| a |\n"
+
+
+def refused(monkeypatch, capsys, *words):
+    """What a command says that ends with 2."""
+    monkeypatch.setattr("sys.argv", ["jaxpend", *map(str, words)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    out, err = capsys.readouterr()
+    assert (end.value.code, out, err.count("\n")) == (2, "", 1)
+    return err
+
+
+TRAJECTORY = "time,pos_meas1,pos_meas2,vel_meas1,vel_meas2,tau_con1,tau_con2\n"
+# A file of a user, and a command that would write another one there.
+OVERWRITTEN = [
+    ("script.py", "import jaxpend\n", "export acrobot_file.npz --to numpy --out"),
+    ("robot.h", "/* with jaxpend */\n", "export acrobot_file.npz --to c --out"),
+    ("notes", "jaxpend.interop.numpy\n", "export acrobot_file.npz --to onnx --out"),
+    ("run.csv", TRAJECTORY, "score --json"),
+    ("run.csv", TRAJECTORY, "robustness --json"),
+    ("run.csv", TRAJECTORY, "runs runs --json"),
+    ("notes.md", "# Notes\n", "leaderboard --json"),
+    ("notes.md", "# Notes\n", "leaderboard --out"),
+    ("notes.md", "# Notes\n", "optimise --robot acrobot --out"),
+    ("run.csv", TRAJECTORY + "0.0e+00,1.0e+00,0,0,0,0,0\n", "score --save"),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "line"), OVERWRITTEN)
+def test_a_file_of_another_kind_is_not_overwritten(place, monkeypatch, capsys, name, text, line):
+    for module in ("score.nominal", "robustness.benchmark", "trajopt.search.find"):
+        monkeypatch.setattr(f"jaxpend.{module}", lambda *_, **__: pytest.fail("it computed"))
+    (place / name).write_text(text)
+    said = refused(monkeypatch, capsys, *line.split(), name)
+    assert name in said
+    assert (place / name).read_text() == text
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "score --save same --json ./same",
+        "leaderboard --json same --out same",
+        "optimise --robot acrobot --json same --out same",
+    ],
+)
+def test_one_file_is_not_named_for_two_things(place, monkeypatch, capsys, line):
+    said = refused(monkeypatch, capsys, *line.split())
+    assert "are both " in said
+    assert not (place / "same").exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("score --policy /dev/zero", "/dev/zero is not a policy file"),
+        ("score --plant /dev/zero", "/dev/zero is not valid YAML"),
+        ("import /dev/zero --robot acrobot --preset evolsac --out new.npz", "/dev/zero is not a "
+         "model"),
+    ],
+)  # fmt: skip
+def test_a_device_without_an_end_is_not_read(place, monkeypatch, capsys, line, words):
+    monkeypatch.setattr(Path, "read_bytes", lambda _: pytest.fail("it would never end"))
+    monkeypatch.setattr(Path, "read_text", lambda *_, **__: pytest.fail("it would never end"))
+    monkeypatch.setattr("zipfile.ZipFile", lambda *_: pytest.fail("it would never end"))
+    assert words in refused(monkeypatch, capsys, *line.split())
+
+
+def test_an_interrupt_in_a_function_of_a_user_is_one(capsys):
+    text = "INTERNAL: CpuCallback error\nTraceback (most recent call last):\nKeyboardInterrupt: "
+    with pytest.raises(SystemExit) as end, cli.one_sentence("prog"):
+        raise RuntimeError(text)
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "prog: interrupted\n"

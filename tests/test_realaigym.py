@@ -190,6 +190,8 @@ def test_the_command_says_where_it_is(tmp_path, monkeypatch, capsys):
         ("1st", None, "the submission would be called '1st', as its folder is; a name has letter"),
         ("a b", None, "the submission would be called 'a b'"),
         ("class", None, "the submission would be called 'class'"),
+        ("tvlqr", None, "double_pendulum has a controller tvlqr already; choose another name"),
+        ("AR-EAPO", None, "double_pendulum has a controller ar_eapo already"),
         ("x" * 41, None, "the submission would be called 'xxx"),
         ("mine", "thesis.tex", "is not empty and holds no submission of jaxpend; choose another"),
         ("mine", "README.md", "is not empty and holds no submission of jaxpend; choose another"),

@@ -325,6 +325,8 @@ BAD = {
     "no bounds": ({"tensors": PPO, "action_space": HUGE}, "its actions are from -inf to inf; they"),
     "one-sided": ({"tensors": network(layers_of(4, 8, 1), "SAC"), "action_space": HUGE | {
         "low": "[0.]", "high": "[6.]"}}, "its actions are from 0 to 6; they must be symmetric"),
+    "tiny": ({"tensors": PPO, "action_space": HUGE | {"low": "[-1e-300]", "high": "[1e-300]"}},
+             "its actions are from -1e-300 to 1e-300; they must be symmetric, and the largest"),
     "no space": ({"tensors": PPO, "action_space": {}}, DAMAGED),
     "not json": ({"tensors": PPO, "data": "{"}, DAMAGED),
     "deep json": ({"tensors": PPO, "data": "[" * 100_000}, DAMAGED),
@@ -379,6 +381,10 @@ def test_what_is_no_plain_actor_is_one_sentence(here, monkeypatch, capsys, case)
      "SAC, which squashes by tanh, not clip"),
     ("model.zip --robot acrobot --preset evolsac --torque-limit 0 --out p.npz", "--torque-limit is"
      " 0.0; it must be positive"),
+    ("model.zip --robot acrobot --preset evolsac --torque-limit 1e39 --out p.npz", "--torque-limit"
+     " is 1e+39; it must be at most 1,000,000,000"),
+    ("model.zip --robot acrobot --preset evolsac --max-velocity 1e-46 --out p.npz", "--max-velocity"
+     " is 1e-46; it must be at least 1e-09"),
     ("model.zip --robot acrobot --preset evolsac", "--out is missing; see jaxpend import --help"),
     ("--robot acrobot --preset evolsac --out p.npz", "MODEL is missing"),
     ("model.zip --robot acrobot --preset evolsac --out -", "--out is -; a policy file cannot"),
@@ -392,6 +398,7 @@ def test_what_is_no_plain_actor_is_one_sentence(here, monkeypatch, capsys, case)
         ("model.zip", "model.zip holds no running statistics of observations"),
         ("s.npz", "mean is (0.0, 0.0, 0.0); it must be 4 values, as many as 'wrapped' sees"),
         ("negative.npz", "negative.npz holds no running statistics"),
+        ("far.npz", "far.npz holds no running statistics"),
         ("large.npz", "large.npz: it has 2,400,"),
         ("off.pkl", "off.pkl: it does not normalise observations; leave it out"))),
 ])  # fmt: skip
@@ -402,6 +409,7 @@ def test_what_is_wrong_on_the_line_is_one_sentence(here, library, monkeypatch, c
     place = whole.index(b"archive/data/0") + 100  # in the numbers of the first layer
     (here / "flip.zip").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
     np.savez(here / "s.npz", mean=np.zeros(3), var=np.ones(3))
+    np.savez(here / "far.npz", mean=np.full(4, 1e300), var=np.ones(4))
     np.savez(here / "negative.npz", mean=np.zeros(4), var=-np.ones(4))
     np.savez(here / "large.npz", mean=np.zeros(300_000), var=np.ones(4))
     (here / "off.pkl").write_bytes(library(norm_obs=False))

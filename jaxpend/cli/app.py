@@ -83,6 +83,10 @@ COMMANDS = {
 }
 
 
+# How jax tells that Ctrl-C came while a compiled loop was in a user's Python function.
+INTERRUPTED = re.compile(r"^(?:\w+: )*KeyboardInterrupt\b", re.MULTILINE)
+
+
 @contextlib.contextmanager
 def one_sentence(prog: str) -> Iterator[None]:
     """Turn what goes wrong in a command into one sentence on standard error and an exit code.
@@ -105,6 +109,8 @@ def one_sentence(prog: str) -> Iterator[None]:
         code, text = 2, f"cannot use{where}: {error.strerror or error}"
     except (MemoryError, RuntimeError) as error:
         code, text = 2, in_words(error)
+        if INTERRUPTED.search(str(error)):
+            code, text = 128 + signal.SIGINT, "interrupted"
         if not text:
             raise
     except KeyboardInterrupt as stop:

@@ -5,6 +5,7 @@ for results are checked before it computes.
 """
 
 import dataclasses
+import os
 import sys
 import time
 from pathlib import Path
@@ -16,7 +17,7 @@ from ..fields import Count, Natural, Positive, Robot, Seed
 from .exporting import export as export
 from .importing import import_ as import_
 from .judging import Subject, board_of
-from .output import check_file, check_folder, emit, emit_json
+from .output import ARRAYS, JSON, MARKDOWN, check_file, check_folder, emit, emit_json
 
 
 def train(config: TrainRun, command: str) -> None:
@@ -66,7 +67,7 @@ def runs(folder: Path = Path("runs"), /, json: str | None = None) -> None:
         folder: folder of run folders.
         json: write the list as JSON to this file, or "-" for standard output.
     """
-    check_file(json)
+    check_file(json, JSON)
     from ..runs.reader import listing
     from .tables import runs_table
 
@@ -134,8 +135,9 @@ def score(
         save: write the run that is judged to this CSV file, which --csv and RealAIGym read.
         json: write the result as JSON to this file, or "-" for standard output.
     """
-    check_file(json)
+    check_file(json, JSON)
     check_file(save)
+    _apart(json=json, save=save)
     subject = Subject(robot, policy, controller, plant, design)
     from .. import boards
     from .tables import score_table
@@ -153,6 +155,14 @@ def score(
     if json != "-":
         score_table({name: result}, board)
     emit_json(result, json)
+
+
+def _apart(**files):
+    """Refuse options that name one file for two things."""
+    first, second = files
+    one, other = (path and str(path) for path in files.values())
+    if one and other and one != "-" and os.path.realpath(one) == os.path.realpath(other):
+        raise JaxpendError(f"--{first} and --{second} are both {one}; name two files")
 
 
 def _scored(subject, board, save):
@@ -229,7 +239,7 @@ def robustness(
         json: write the result as JSON to this file, or "-" for standard output.
     """
     check_folder(out)
-    check_file(json)
+    check_file(json, JSON)
     subject = Subject(robot, policy, controller, plant, design, torque_limit)
     import jax
 
@@ -293,8 +303,9 @@ def leaderboard(
         json: write the result as JSON to this file, or "-" for standard output.
         out: write the table as Markdown to this file, or "-" for standard output.
     """
-    check_file(json)
-    check_file(out)
+    check_file(json, JSON)
+    check_file(out, MARKDOWN)
+    _apart(json=json, out=out)
     from .. import leaderboard as boards
     from ..terminal import console
     from .tables import leaderboard_table
@@ -327,8 +338,9 @@ def optimise(
         json: report of all optima to write; "-" for standard output.
         search: how widely to look.
     """
-    check_file(out)
-    check_file(json)
+    check_file(out, ARRAYS)
+    check_file(json, JSON)
+    _apart(json=json, out=out)
     import jax
 
     from ..boards import v2

@@ -5,7 +5,7 @@ from typing import Literal
 
 from ..config import Activation
 from ..errors import JaxpendError
-from ..fields import Positive, Robot
+from ..fields import Robot, Scale
 from .output import check_file
 
 __all__ = ["import_"]
@@ -21,8 +21,8 @@ def import_(
     command: str,
     preset: Literal["evolsac", "ar_eapo", "gymnasium"] | None = None,
     observation: Seen | None = None,
-    max_velocity: Positive | None = None,
-    torque_limit: Positive | None = None,
+    max_velocity: Scale | None = None,
+    torque_limit: Scale | None = None,
     statistics: Path | None = None,
     squash: Literal["tanh", "clip"] | None = None,
     activation: Activation | None = None,

@@ -8,7 +8,13 @@ from typing import Any
 from ..errors import JaxpendError
 from ..files import to_json, write_atomically
 
-__all__ = ["check_file", "check_folder", "drop_unwritable", "emit", "emit_json"]
+__all__ = [
+    "ARRAYS", "JSON", "MARKDOWN", "check_file", "check_folder", "drop_unwritable", "emit",
+    "emit_json",
+]  # fmt: skip
+
+# How files begin that commands write, of all that is written with one purpose.
+JSON, MARKDOWN, ARRAYS = (b"{", b"["), (b"| controller ",), (b"PK",)
 
 
 def emit(text: str, target: str | Path | None) -> None:
@@ -25,10 +31,11 @@ def emit_json(value: Any, target: str | Path | None) -> None:
     emit(to_json(value, indent=2) + "\n", target)
 
 
-def check_file(path: str | Path | None) -> None:
+def check_file(path: str | Path | None, begins: tuple[bytes, ...] = ()) -> None:
     """Raise ``JaxpendError`` if a file could not be written; None and "-" are as in ``emit``.
 
-    Commands ask before they compute, so that a mistyped name does not cost minutes.
+    So too if one is there that does not begin as what is written instead, where ``begins`` says
+    that. Commands ask before they compute, so that a mistyped name does not cost minutes.
     """
     if path is None:
         return
@@ -39,6 +46,12 @@ def check_file(path: str | Path | None) -> None:
     if Path(path).is_dir():
         raise JaxpendError(f"cannot write {path}: it is a folder")
     check_folder(Path(path).parent)
+    if begins and Path(path).is_file():
+        with Path(path).open("rb") as file:
+            start = file.read(max(map(len, begins)))
+        if start and not start.startswith(begins):
+            text = f"cannot write {path}: it is there and is something else; choose another name"
+            raise JaxpendError(text)
 
 
 def check_folder(path: str | Path | None) -> None:

@@ -18,6 +18,13 @@ from ..pytree import pytree, static
 __all__ = ["PythonLaw", "is_realaigym", "realaigym"]
 
 
+def _real(torque: Any) -> np.ndarray:
+    """Torques as float64. Raises as numpy does for what is no real number."""
+    if np.iscomplexobj(torque):
+        raise TypeError("a torque is complex; it must be real")
+    return np.asarray(torque, float)
+
+
 @pytree
 class PythonLaw(Memoryless):
     """A plain function ``law(t, x) -> torque``, numpy or anything else, without memory.
@@ -43,7 +50,7 @@ class PythonLaw(Memoryless):
                 u = self.law(times, states)
             else:
                 u = [self.law(float(a), b) for a, b in zip(times, states, strict=True)]
-            torque = np.asarray(u, x.dtype)
+            torque = _real(u)
         except JaxpendError:
             raise
         except THEIRS as error:
@@ -52,7 +59,8 @@ class PythonLaw(Memoryless):
             shape = torque.shape if self.batched else torque.shape[1:]
             wanted = f"({t.size}, 2)" if self.batched else "(2,)"
             raise JaxpendError(f"{name} returns a torque of shape {shape}; it must be {wanted}")
-        return torque.reshape(*x.shape[:-1], 2)
+        with np.errstate(over="ignore"):  # what is too large is infinite
+            return torque.reshape(*x.shape[:-1], 2).astype(x.dtype)
 
     def check(self) -> None:
         """Call the law once, hanging at rest. Raises ``JaxpendError`` if it gives no torque."""
@@ -100,7 +108,7 @@ class _Copies:
         for row, (one, t, x) in enumerate(zip(self._running, times, states, strict=True)):
             if np.isfinite(x).all():
                 call = getattr(one, "get_control_output", one.get_control_output_)
-                torque = np.asarray(call(np.array(x, float), float(t)), float)
+                torque = _real(call(np.array(x, float), float(t)))
                 if torque.shape != (2,):
                     text = f"{self.__name__} returns a torque of shape {torque.shape}"
                     raise JaxpendError(f"{text}; it must be (2,)")

@@ -169,6 +169,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     try:
         return read_arrays(path, "policy")
     except JaxpendError:
+        if not path.is_file():
+            raise
         with contextlib.suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
             if "policy.pth" in archive.namelist():
                 text = f"{path} is a model of Stable-Baselines3; make a policy file of it with"

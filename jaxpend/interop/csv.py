@@ -47,6 +47,8 @@ def load_csv(path: str | Path) -> Trajectory:
             f"{path} has no column {', '.join(lacking)}; it must have the columns {HEADER}"
         )
     kind = MEASURED if all(name in names for name in MEASURED) else PLANNED
+    if twice := [name for name in ("time", *kind) if names.count(name) > 1]:
+        raise JaxpendError(f"{path} has the column {twice[0]} twice; which one counts is not clear")
     columns = [names.index(name) for name in ("time", *kind)]
     numbers = [
         _numbers(path, line, row, names, columns) for line, row in enumerate(rows[1:], 2) if row
@@ -104,8 +106,17 @@ def check_target(path: str | Path) -> None:
         raise JaxpendError("a trajectory is written to a file; - is none")
     if there.is_file() and there.stat().st_size:
         with there.open("rb") as file:
-            if file.readline(1000).strip() != HEADER.encode():
+            first, row = file.readline(1000).strip(), file.readline(1000).strip()
+            if first != HEADER.encode() or not _is_ours(row):
                 raise JaxpendError(f"{path} is not a trajectory of jaxpend; name another file")
+
+
+def _is_ours(row: bytes) -> bool:
+    """Whether ``save_csv`` wrote a row, in as few digits as its numbers need; others do not."""
+    try:
+        return row == b",".join(b"%.17g" % float(number) for number in row.split(b","))
+    except ValueError:
+        return False
 
 
 def save_csv(path: str | Path, run: Trajectory) -> None:

@@ -7,6 +7,7 @@ way, an object of that interface as a controller here, is ``controllers.callback
 """
 
 import keyword
+import os
 import re
 import textwrap
 from collections.abc import Callable, Mapping
@@ -30,6 +31,13 @@ __all__ = ["check_target", "export", "submission", "write"]
 TITLE = "a submission of jaxpend to RealAIGym"
 BOARDS = ("simulation_v2", "robustness_v2")  # folders there, for performance and robustness
 NAME = re.compile("[a-z][a-z0-9_]{0,39}")
+# What that package has in its folder of controllers, which a submission would be copied over.
+TAKEN = {
+    "acados_mpc", "ar_eapo", "dqn", "energy", "evolsac", "friction_compensation", "gamepad",
+    "gravity_compensation", "history_sac", "ilqr", "inverse_dynamics", "lqr", "mcpilco",
+    "partial_feedback_linearization", "pid", "prx", "prx_flow_matching", "random_exploration",
+    "sac", "trajectory_following", "tvlqr", "vimppi",
+}  # fmt: skip
 
 CLASS = '''
 
@@ -107,15 +115,18 @@ def check_target(folder: str | Path) -> str:
     """The name of a submission, which is that of its folder.
 
     Raises:
-        JaxpendError: a name that is none in Python, or a folder with something else in it.
+        JaxpendError: a name that is none in Python or is taken there, or a folder with something
+            else in it.
     """
     folder = Path(folder)
-    name = folder.resolve().name.lower().replace("-", "_")
+    name = Path(os.path.abspath(folder)).name.lower().replace("-", "_")
     if not NAME.fullmatch(name) or keyword.iskeyword(name):
         raise JaxpendError(
             f"the submission would be called {name!r}, as its folder is; a name has letters, "
             "digits and underscores, a letter first, and 40 at most"
         )
+    if name in TAKEN:
+        raise JaxpendError(f"double_pendulum has a controller {name} already; choose another name")
     if folder.exists() and not folder.is_dir():
         raise JaxpendError(f"cannot write into {folder}: it is not a folder")
     readme = folder / "README.md"

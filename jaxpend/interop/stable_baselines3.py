@@ -21,7 +21,7 @@ import numpy as np
 from ..config import Activation, EnvConfig
 from ..controllers.policy import Policy
 from ..errors import JaxpendError, choose
-from ..fields import Checked, Positive
+from ..fields import Checked, Scale
 from ..observation import Observation
 from ..robots import ROBOTS
 from .tensors import MOST_PICKLE, MOST_TENSORS, Name, StateDict, array, description, member, shown
@@ -56,6 +56,9 @@ ACTIVATION_OF = {"ReLU": "relu", "Tanh": "tanh", "SiLU": "silu"}
 MOST_OPTIONS = 2**24  # bytes of JSON
 
 
+LEAST, MOST = 1e-9, 1e9  # as those of ``Scale``
+
+
 @dataclasses.dataclass(frozen=True)
 class Convention(Checked):
     """What the environment was that a policy was trained in. Raises ``JaxpendError`` as fields do.
@@ -67,8 +70,8 @@ class Convention(Checked):
     """
 
     observation: Literal["wrapped", "sincos", "sincos_clipped", "sincos_by_joint", "state"]
-    max_velocity: Positive  # rad/s, velocities are divided by it, and clipped there if clipped
-    torque_limit: Positive  # N m, torque at the largest action
+    max_velocity: Scale  # rad/s, velocities are divided by it, and clipped there if clipped
+    torque_limit: Scale  # N m, torque at the largest action
     statistics: str | None = None  # file, see ``read_statistics``; None: it does not normalise
     squash: Literal["tanh", "clip"] | None = None  # of the mean action; None: as the library does
     activation: Activation | None = None  # None: as the zip says
@@ -130,6 +133,8 @@ def read_model(path: str | Path, robot: str, convention: Convention) -> Model:
     choose("robot", robot, ROBOTS)
     statistics = convention.statistics and read_statistics(convention.statistics)
     try:
+        if Path(path).is_char_device():  # /dev/zero has no end
+            raise OSError
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
             if "policy.pth" not in names or "data" not in names:
@@ -265,8 +270,9 @@ def _bound(options: dict[str, Any]) -> float:
     """The largest action; the smallest must be its opposite."""
     space = options["action_space"]
     low, high = (float(str(space[end]).strip("[] ")) for end in ("low", "high"))
-    if not (0 < high < math.inf and low == -high):
-        raise JaxpendError(f"its actions are from {low:g} to {high:g}; they must be symmetric")
+    if not (LEAST <= high <= MOST and low == -high):
+        text = f"they must be symmetric, and the largest {LEAST:g} to {MOST:g}"
+        raise JaxpendError(f"its actions are from {low:g} to {high:g}; {text}")
     return high
 
 
@@ -300,8 +306,10 @@ def read_statistics(path: str | Path) -> Statistics:
         found = _arrays(path) if content[:2] == b"PK" else _vec_normalize(content)
         mean, var = found["mean"], found["var"]
         epsilon, clip = float(found["epsilon"]), float(found["clip"])
+        std = np.sqrt(var + epsilon)
         fits = mean.ndim == 1 and mean.shape == var.shape and (var >= 0).all() and epsilon > 0
-        if not (fits and np.isfinite([mean, var]).all() and clip > 0):
+        fits = fits and (abs(mean) <= MOST).all() and (std >= LEAST).all() and (std <= MOST).all()
+        if not (fits and clip >= LEAST):
             raise ValueError("no statistics")
     except FileNotFoundError:
         raise JaxpendError(f"there are no running statistics {path}") from None
@@ -310,7 +318,7 @@ def read_statistics(path: str | Path) -> Statistics:
     except Exception:  # whatever zipfile and numpy raise for bytes that are not theirs
         text = f"{path} holds no running statistics of observations, or it is cut off or damaged"
         raise JaxpendError(f"{text}; a VecNormalize or a .npz of mean and var is read") from None
-    return Statistics(mean, np.sqrt(var + epsilon), clip if math.isfinite(clip) else None)
+    return Statistics(mean, std, clip if math.isfinite(clip) else None)
 
 
 def _vec_normalize(content: bytes) -> dict[str, np.ndarray]:
