@@ -196,24 +196,31 @@ def init(
     ``task`` may be left out for a controller that knows its robot (``boards.own_task``).
 
     Raises:
-        JaxpendError: as ``search_space.kinds``, or retention of what is not a policy alone.
+        JaxpendError: as ``search_space.kinds``, or retention of what is not a policy alone, or
+            of nothing, since a run is over before ``retained_after``.
     """
     check_controller(controller)
     z, weights, _ = coordinates(controller, config.searched)
     state = GradientState(z, _adam(config, weights).init(z), key, jnp.zeros((), jnp.int32))
     if not config.retention:
         return state
-    _check_retention(controller)
-    return state.replace(retained=_watched(config, controller, own_task(controller, task)))
+    task = _check_retention(config, controller, task)
+    return state.replace(retained=_watched(config, controller, task))
 
 
 _watched = jax.jit(retained, static_argnames=("config", "task"))
 
 
-def _check_retention(controller: Controller) -> None:
+def _check_retention(config: GradientConfig, controller: Controller, task: Task | None) -> Task:
+    """The task in which actions are kept; refuse what has none to keep."""
     if not isinstance(controller, Policy):
         text = "it needs a policy without a guard, and not"
         raise JaxpendError(f"retention keeps actions of a network; {text} {controller!r:.40}")
+    task = own_task(controller, task)
+    if config.retained_after >= task.duration:
+        text = f"retained_after is {config.retained_after} s; it must be less than"
+        raise JaxpendError(f"{text} the {task.duration:g} s of a run")
+    return task
 
 
 @partial(jax.jit, static_argnames=("config", "steps", "task"))
@@ -262,7 +269,7 @@ class Gradient(SearchStage):
         """Raises ``JaxpendError`` as ``init``."""
         super().__init__(config, policy, task)
         if config.retention:
-            _check_retention(policy)
+            _check_retention(config, policy, task)
 
     name, title, unit, column = "gradient", "Gradient", "steps", "step"
     heading, scores = "after the gradient", ("score",)
