@@ -52,8 +52,6 @@ REGION = {
 # model or has friction; the acrobot is better off without.
 SURPLUS = {"acrobot": None, "pendubot": 0.7}
 MARGIN = 1.1  # of time and energy, beyond what the controller needs on the nominal plant
-
-
 FORGETTING = 0.1  # s, the time over which noise is averaged
 
 
@@ -82,6 +80,7 @@ class KalmanFilter(Pytree):
     def reset(self) -> Seen:
         """Memory before the first measurement."""
         two, four = jnp.zeros((2, 2)), jnp.zeros(4)
+        # Variances; that of the first velocity, 1 rad^2/s^2, is only to be large.
         spread = jnp.stack([self.least[0] ** 2, jnp.ones(()), FORGETTING * self.disturbance**2])
         covariance = jnp.eye(3)[..., None] * jnp.broadcast_to(spread[:, None, None], (3, 1, 2))
         return Seen(jnp.array(False), four, four[:2], four[:2], covariance, two, two)
@@ -189,8 +188,8 @@ class Observer(Pytree):
         return (*memory[:3], jnp.clip(torque, -limit, limit).astype(memory[3].dtype))
 
 
-def surplus(plant: Plant, x: jax.Array) -> jax.Array:
-    """Energy () of state ``x`` (4,) above that of upright, J."""
+def energy_above_upright(plant: Plant, x: jax.Array) -> jax.Array:
+    """Energy () of state ``x`` (4,), J, beyond that of standing upright."""
     return total_energy(plant, x) - total_energy(plant, jnp.array(UPRIGHT, x.dtype))
 
 
@@ -214,7 +213,7 @@ class Rescue(Pytree):
         failed = (t > self.after) & self.away(x)
         if self.excess is None or self.plant is None:
             return failed
-        return failed | (surplus(self.plant, x) > self.excess)
+        return failed | (energy_above_upright(self.plant, x) > self.excess)
 
 
 @pytree
@@ -259,7 +258,7 @@ def _patient(main: Controller, plant: Plant, rescue: Rescue) -> Rescue:
     if not upright(x[-1]) or rescue.excess is None:
         return rescue
     late = DT * jnp.max(jnp.where(jax.vmap(rescue.away)(x), jnp.arange(len(x)), 0))
-    most = jax.vmap(surplus, (None, 0))(plant, x).max()
+    most = jax.vmap(energy_above_upright, (None, 0))(plant, x).max()
     return rescue.replace(
         after=jnp.maximum(rescue.after, MARGIN * late).astype(rescue.after.dtype),
         excess=jnp.maximum(rescue.excess, MARGIN * most).astype(rescue.excess.dtype),
