@@ -249,9 +249,9 @@ def improve(
                 lambda z: change(rebuild(z), kept, jax.random.fold_in(key_now, 1))
             )(z)
             ascent, metrics = ascent - config.retention * found[1], metrics | {"change": found[0]}
-        step, memory = optimizer.update(ascent, state.optimizer)
+        move, memory = optimizer.update(ascent, state.optimizer)
         lost = state.lost + lost
-        state = state.replace(parameters=z + step, optimizer=memory, key=key, lost=lost)
+        state = state.replace(parameters=z + move, optimizer=memory, key=key, lost=lost)
         return state, metrics | {"slope": jnp.linalg.norm(ascent)}
 
     return jax.lax.scan(step, state, length=steps)
