@@ -113,6 +113,13 @@ def robustness(
     return uprightness(run.x).mean()
 
 
+def _check_time(config: GradientConfig, task: Task) -> None:
+    """Refuse a time from which on there is nothing to retain."""
+    if config.retained_after >= task.duration:
+        text = f"retained_after is {config.retained_after} s; it must be less than"
+        raise JaxpendError(f"{text} the {task.duration:g} s of a run")
+
+
 def retained(config: GradientConfig, policy: Policy, task: Task) -> Retained:
     """What a policy does in scenarios of a task after ``config.retained_after`` s."""
     key_scenarios, key_runs = jax.random.split(jax.random.key(SHOWN_SEED))
@@ -204,23 +211,19 @@ def init(
     state = GradientState(z, _adam(config, weights).init(z), key, jnp.zeros((), jnp.int32))
     if not config.retention:
         return state
-    task = _check_retention(config, controller, task)
+    _check_retention(controller)
+    task = own_task(controller, task)
+    _check_time(config, task)
     return state.replace(retained=_watched(config, controller, task))
 
 
 _watched = jax.jit(retained, static_argnames=("config", "task"))
 
 
-def _check_retention(config: GradientConfig, controller: Controller, task: Task | None) -> Task:
-    """The task in which actions are kept; refuse what has none to keep."""
+def _check_retention(controller: Controller) -> None:
     if not isinstance(controller, Policy):
         text = "it needs a policy without a guard, and not"
         raise JaxpendError(f"retention keeps actions of a network; {text} {controller!r:.40}")
-    task = own_task(controller, task)
-    if config.retained_after >= task.duration:
-        text = f"retained_after is {config.retained_after} s; it must be less than"
-        raise JaxpendError(f"{text} the {task.duration:g} s of a run")
-    return task
 
 
 @partial(jax.jit, static_argnames=("config", "steps", "task"))
@@ -269,7 +272,8 @@ class Gradient(SearchStage):
         """Raises ``JaxpendError`` as ``init``."""
         super().__init__(config, policy, task)
         if config.retention:
-            _check_retention(config, policy, task)
+            _check_retention(policy)
+            _check_time(config, task)
 
     name, title, unit, column = "gradient", "Gradient", "steps", "step"
     heading, scores = "after the gradient", ("score",)

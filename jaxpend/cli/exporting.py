@@ -9,8 +9,8 @@ from .output import check_file, check_folder
 
 __all__ = ["export"]
 
-# What every file that is written here says near its start, and a file of a user does not.
-WRITTEN = re.compile(rb"The controller \w+( of jaxpend, one step in |; see jaxpend\.interop\.onnx)")
+# Near the start of every file that is written here, and of no other that names this package.
+MARK = re.compile(rb"; jaxpend\.interop\.\w+ wrote it|; see jaxpend\.interop\.onnx\.")
 START = 400  # bytes
 
 
@@ -93,6 +93,6 @@ def _check_out(out: Path) -> None:
     if out.is_file():
         with out.open("rb") as file:
             start = file.read(START)
-        if start and not WRITTEN.search(start):
+        if start and not MARK.search(start):
             text = f"cannot write {out}: it is there and was not exported; choose another name"
             raise JaxpendError(text)

@@ -52,6 +52,8 @@ REGION = {
 # model or has friction; the acrobot is better off without.
 SURPLUS = {"acrobot": None, "pendubot": 0.7}
 MARGIN = 1.1  # of time and energy, beyond what the controller needs on the nominal plant
+
+
 FORGETTING = 0.1  # s, the time over which noise is averaged
 
 
@@ -80,7 +82,6 @@ class KalmanFilter(Pytree):
     def reset(self) -> Seen:
         """Memory before the first measurement."""
         two, four = jnp.zeros((2, 2)), jnp.zeros(4)
-        # Variances; that of the first velocity, 1 rad^2/s^2, is only to be large.
         spread = jnp.stack([self.least[0] ** 2, jnp.ones(()), FORGETTING * self.disturbance**2])
         covariance = jnp.eye(3)[..., None] * jnp.broadcast_to(spread[:, None, None], (3, 1, 2))
         return Seen(jnp.array(False), four, four[:2], four[:2], covariance, two, two)

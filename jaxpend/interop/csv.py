@@ -21,7 +21,6 @@ __all__ = ["check_target", "load_csv", "save_csv"]
 MEASURED = ("pos_meas1", "pos_meas2", "vel_meas1", "vel_meas2", "tau_con1", "tau_con2")
 PLANNED = ("pos1", "pos2", "vel1", "vel2", "tau1", "tau2")
 HEADER = ",".join(("time", *MEASURED))
-NUMBER = "%.17g"  # read again, it is the same number
 LARGEST = 256 * 2**20  # bytes; ten seconds at 500 Hz are one megabyte
 
 
@@ -99,24 +98,21 @@ def _numbers(
 
 
 def check_target(path: str | Path) -> None:
-    """Raise ``JaxpendError`` if a file is there that ``save_csv`` did not write.
-
-    RealAIGym's own recordings have the same header; they are told apart by how numbers are written.
-    """
+    """Raise ``JaxpendError`` if a file is there that ``save_csv`` did not write."""
     there = Path(path)
     if str(path) == "-":
         raise JaxpendError("a trajectory is written to a file; - is none")
     if there.is_file() and there.stat().st_size:
         with there.open("rb") as file:
-            header, first = (file.readline(1000).strip() for _ in range(2))
-        if header != HEADER.encode() or not _is_written(first):
-            raise JaxpendError(f"{path} is not a trajectory of jaxpend; name another file")
+            first, row = file.readline(1000).strip(), file.readline(1000).strip()
+            if first != HEADER.encode() or not _is_ours(row):
+                raise JaxpendError(f"{path} is not a trajectory of jaxpend; name another file")
 
 
-def _is_written(row: bytes) -> bool:
-    """Whether every number of a row is written as ``save_csv`` does it."""
+def _is_ours(row: bytes) -> bool:
+    """Whether ``save_csv`` wrote a row, in as few digits as its numbers need; others do not."""
     try:
-        return all(NUMBER % float(cell) == cell.decode() for cell in row.split(b","))
+        return row == b",".join(b"%.17g" % float(number) for number in row.split(b","))
     except ValueError:
         return False
 
@@ -136,5 +132,5 @@ def save_csv(path: str | Path, run: Trajectory) -> None:
         raise JaxpendError(f"the torques have shape {u.shape}; a file holds one run, (N, 2)")
     t, x = np.asarray(run.t, float)[: len(u)], np.asarray(run.x, float)[: len(u)]
     lines = io.StringIO()
-    np.savetxt(lines, np.column_stack([t, x, u]), NUMBER, ",", header=HEADER, comments="")
+    np.savetxt(lines, np.column_stack([t, x, u]), "%.17g", ",", header=HEADER, comments="")
     write_atomically(path, lines.getvalue())

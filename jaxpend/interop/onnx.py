@@ -21,12 +21,12 @@ import numpy as np
 
 from ..controller import Controller
 from ..errors import JaxpendError, choose
-from .program import Node, Program, is_constant, types_of
+from .program import Node, Program, is_constant
 from .trace import trace
 
 __all__ = ["model"]
 
-OPSET, IR = 18, 9  # of 2022 and 2023, which runtimes of the last years all read
+OPSET, IR = 18, 9  # of 2022 and 2023: what is not brand-new reads them
 PRECISIONS = ("float32", "float64")
 OPERATORS = {
     "add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "neg": "Neg", "abs": "Abs",
@@ -69,7 +69,7 @@ class _Graph:
 
         self.helper, self.program = helper, program
         single = program.precision == "float32"
-        self.types = types_of(program.precision)
+        self.types = program.types
         self.tensors = {
             "float": TensorProto.FLOAT if single else TensorProto.DOUBLE,
             "int": TensorProto.INT64,

@@ -29,7 +29,6 @@ __all__ = [
     "is_constant",
     "is_range",
     "named",
-    "types_of",
 ]
 
 
@@ -63,6 +62,11 @@ class Program:
     state: tuple[Leaf, ...]
     next_state: tuple[tuple[Node, ...], ...]  # of a leaf: its entries, or one vector
     torque: tuple[Node, Node]  # N m
+
+    @property
+    def types(self) -> dict[str, np.dtype]:
+        """The type in numpy of every kind of node."""
+        return _types_of(self.precision)
 
     @property
     def outputs(self) -> tuple[Node, ...]:
@@ -164,8 +168,7 @@ BOOLEAN = {"lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "finite", "bo
 KINDS = {"f": "float", "i": "int", "u": "int", "b": "bool"}
 
 
-def types_of(precision: str) -> dict[str, np.dtype]:
-    """The type in numpy of every kind of node in a program of that precision."""
+def _types_of(precision: str) -> dict[str, np.dtype]:
     return {"float": np.dtype(precision), "int": np.dtype("i8"), "bool": np.dtype("?")}
 
 
@@ -173,7 +176,7 @@ class Builder:
     """Makes nodes: one for equal values, a constant where all arguments are."""
 
     def __init__(self, precision: str):
-        self.types = types_of(precision)
+        self.types = _types_of(precision)
         self._known: dict[Any, Node] = {}
 
     def node(self, op: str, args: tuple[Node, ...] = (), kind: str = "float",
