@@ -4,7 +4,7 @@ git clone https://github.com/dfki-ric-underactuated-lab/double_pendulum
 python experiments/published.py double_pendulum/data/policies/design_C.1
 python experiments/published.py double_pendulum/data/policies/design_C.1 --rounding 8
 
-The second prints how far the criterion of delay, in which nothing is drawn, depends on rounding.
+The last line prints how far the criterion of delay, in which nothing is drawn, depends on rounding.
 Nothing of that repository is copied; the script reads the models where they lie.
 """
 

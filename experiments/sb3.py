@@ -53,7 +53,7 @@ class Environments(VecEnv):
         return self.envs.reset(seed=self._seeds[0])[0]
 
     def step_async(self, actions):
-        """Nothing happens before ``step_wait``."""
+        """Keep the actions for ``step_wait``, which takes the step."""
         self.actions = actions
 
     def step_wait(self):
@@ -69,19 +69,19 @@ class Environments(VecEnv):
         self.envs.close()
 
     def get_attr(self, attr_name, indices=None):
-        """Of all of them, which are one."""
+        """The attribute of the vector environment, once for every environment."""
         return [getattr(self.envs, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name, value, indices=None):
-        """Of all of them."""
+        """Set an attribute of the vector environment, which all environments share."""
         setattr(self.envs, attr_name, value)
 
     def env_method(self, method_name, *args, indices=None, **kwargs):
-        """None has methods of its own."""
+        """Environments inside the vector environment have no methods to call."""
         raise NotImplementedError
 
     def env_is_wrapped(self, wrapper_class, indices=None):
-        """None is."""
+        """No environment inside the vector environment is wrapped."""
         return [False] * len(list(self._get_indices(indices)))
 
 

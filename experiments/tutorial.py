@@ -75,7 +75,7 @@ run = jax.jit(rollout)(Scenario(plant), mine, jax.random.key(0))
 print("state after 10 s:", np.round(run.x[-1], 3))
 
 # %% From a loop of your own: a state in, a torque out, both numpy
-# On a robot nobody hands jax arrays around. ``start`` gives an object that keeps the controller's
+# The loop of a robot knows nothing of jax. ``start`` gives an object that keeps the controller's
 # memory and counts the time, 2 ms a call; ``reset`` begins a new run. ``Stepper`` does the same
 # for a controller of your own.
 stepper, own = load_policy("pendubot").start(), Stepper(mine)

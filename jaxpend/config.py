@@ -25,7 +25,9 @@ from .fields import (
 from .observation import Observation
 
 __all__ = [
+    "ACTIVATIONS",
     "LINES",
+    "STRATEGIES",
     "Activation",
     "CheckpointConfig",
     "DemonstrationConfig",

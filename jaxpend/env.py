@@ -115,9 +115,8 @@ class Env:
     def reset(self, key: jax.Array) -> EnvState:
         """A new episode, hanging at rest, near upright or anywhere.
 
-        ``key`` draws which, and the scenario.
-
-        ``key`` is consumed; it may be a typed one or of the old style.
+        ``key`` draws which, and the scenario. It is consumed, and may be a typed one or of the
+        old style.
         """
         x, zero, past, world = self._start(key), jnp.zeros(()), None, None
         if self.config.observation.history:

@@ -113,6 +113,13 @@ def robustness(
     return uprightness(run.x).mean()
 
 
+def _check_time(config: GradientConfig, task: Task) -> None:
+    """Refuse a time from which on there is nothing to retain."""
+    if config.retained_after >= task.duration:
+        text = f"retained_after is {config.retained_after} s; it must be less than"
+        raise JaxpendError(f"{text} the {task.duration:g} s of a run")
+
+
 def retained(config: GradientConfig, policy: Policy, task: Task) -> Retained:
     """What a policy does in scenarios of a task after ``config.retained_after`` s."""
     key_scenarios, key_runs = jax.random.split(jax.random.key(SHOWN_SEED))
@@ -196,7 +203,8 @@ def init(
     ``task`` may be left out for a controller that knows its robot (``boards.own_task``).
 
     Raises:
-        JaxpendError: as ``search_space.kinds``, or retention of what is not a policy alone.
+        JaxpendError: as ``search_space.kinds``, or retention of what is not a policy alone, or
+            of nothing, since a run is over before ``retained_after``.
     """
     check_controller(controller)
     z, weights, _ = coordinates(controller, config.searched)
@@ -204,7 +212,9 @@ def init(
     if not config.retention:
         return state
     _check_retention(controller)
-    return state.replace(retained=_watched(config, controller, own_task(controller, task)))
+    task = own_task(controller, task)
+    _check_time(config, task)
+    return state.replace(retained=_watched(config, controller, task))
 
 
 _watched = jax.jit(retained, static_argnames=("config", "task"))
@@ -244,9 +254,9 @@ def improve(
                 lambda z: change(rebuild(z), kept, jax.random.fold_in(key_now, 1))
             )(z)
             ascent, metrics = ascent - config.retention * found[1], metrics | {"change": found[0]}
-        step, memory = optimizer.update(ascent, state.optimizer)
+        move, memory = optimizer.update(ascent, state.optimizer)
         lost = state.lost + lost
-        state = state.replace(parameters=z + step, optimizer=memory, key=key, lost=lost)
+        state = state.replace(parameters=z + move, optimizer=memory, key=key, lost=lost)
         return state, metrics | {"slope": jnp.linalg.norm(ascent)}
 
     return jax.lax.scan(step, state, length=steps)
@@ -265,6 +275,7 @@ class Gradient(SearchStage):
         super().__init__(config, policy, task)
         if config.retention:
             _check_retention(policy)
+            _check_time(config, task)
 
     name, title, unit, column = "gradient", "Gradient", "steps", "step"
     heading, scores = "after the gradient", ("score",)

@@ -33,14 +33,14 @@ from .rollout import Trajectory, rollout
 from .scenario import Scenario
 from .variations import LONGEST_DELAY
 
-# N m, with which a robot's passive joint may be driven against its friction.
-PASSIVE = 0.5
-
 __all__ = [
     "V1_DEFAULT", "V1_OFFICIAL", "V2_HARDWARE", "V2_OFFICIAL", "Criteria", "ScoreV2", "ScoreV3",
     "combined", "criteria", "imperfect", "nominal", "nominal_run", "official", "official_run",
     "performance", "recorded", "score_v1", "score_v2", "score_v3",
 ]  # fmt: skip
+
+# N m, with which a robot's passive joint may be driven against its friction.
+PASSIVE = 0.5
 
 
 def performance(
@@ -75,7 +75,10 @@ def imperfect(
 def combined(
     objective: Objective, score: jax.Array, met: tuple[Criteria, jax.Array], task: Task
 ) -> jax.Array:
-    """What a controller is worth (), of its score () and of ``imperfect`` runs that it met."""
+    """What a controller is worth (): the weighted mean of its score () and of random scenarios.
+
+    ``met`` is what ``imperfect`` says of them: criteria, and which end upright, (count,).
+    """
     c, stands = met
     outcome = stands if objective.outcome == "success" else task.score(c)
     return (1 - objective.weight) * score + objective.weight * outcome.mean()
@@ -104,6 +107,15 @@ def _in_float64(leaf: Any) -> Any:
     return jnp.asarray(leaf, "f8") if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) else leaf
 
 
+def _ready(controller: Controller, task: Task) -> Controller:
+    """The controller in float64. Raises ``JaxpendError`` if it cannot be judged on the task."""
+    check_form(controller)
+    check_robot(controller, task.robot)
+    controller = jax.tree.map(_in_float64, controller)
+    check_controller(controller)
+    return controller
+
+
 def official(controller: Controller, judged_on: Board | str) -> dict[str, Any]:
     """Score, success and criteria of a controller as plain numbers, computed in float64.
 
@@ -115,23 +127,20 @@ def official(controller: Controller, judged_on: Board | str) -> dict[str, Any]:
         JaxpendError: it is no controller, or one of the other robot.
     """
     task = board(judged_on).task
-    check_form(controller)
-    check_robot(controller, task.robot)
     with jax.enable_x64(True):
-        controller = jax.tree.map(_in_float64, controller)
-        check_controller(controller)
-        return _plain(nominal(controller, task), task)
+        return _plain(nominal(_ready(controller, task), task), task)
 
 
-def official_run(controller: Controller, judged_on: Board | str) -> tuple[Trajectory, dict]:
-    """The run that ``official`` judges, in float64, and what ``official`` says of it."""
+def official_run(
+    controller: Controller, judged_on: Board | str
+) -> tuple[Trajectory, dict[str, Any]]:
+    """The run that ``official`` judges, in float64, and what ``official`` says of it.
+
+    Arguments and errors are those of ``official``.
+    """
     task = board(judged_on).task
-    check_form(controller)
-    check_robot(controller, task.robot)
     with jax.enable_x64(True):
-        controller = jax.tree.map(_in_float64, controller)
-        check_controller(controller)
-        run, c = nominal_run(controller, task)
+        run, c = nominal_run(_ready(controller, task), task)
         return run, _plain(c, task)
 
 
@@ -146,7 +155,8 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
             exact, and whose passive joint may be driven against its friction.
 
     Raises:
-        JaxpendError: it is none of this board's runs.
+        JaxpendError: it is none of this board's runs: longer, or of another robot, or, where it
+            must be regular, on another time grid.
     """
     task = board(judged_on).task
     t, u = np.asarray(run.t, float), np.asarray(run.u, float)

@@ -141,6 +141,12 @@ def test_runs_of_something_else_are_refused(run, regular, words):
         recorded(run, ROBOT, regular=regular)
 
 
+# As the reference writes a simulated run.
+THEIRS = "time,pos_meas1,pos_meas2,vel_meas1,vel_meas2,tau_con1,tau_con2\n" + ",".join(
+    ["0.000000000000000000e+00"] * 7
+)
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [
@@ -151,21 +157,23 @@ def test_runs_of_something_else_are_refused(run, regular, words):
         ("--csv {run} --controller a", "--csv is a run that is there already; leave out --cont"),
         ("--csv {run} --save b", "--csv is a run that is there already; leave out --save"),
         ("--save {other}", "{other} is not a trajectory of jaxpend; name another file"),
+        ("--save {theirs}", "{theirs} is not a trajectory of jaxpend; name another file"),
         ("--save -", "a trajectory is written to a file; - is none"),
         ("--save {other}/a", "cannot write into {other}: {other} is not a folder"),
     ],
 )
 def test_the_command_says_what_is_wrong(file, tmp_path, monkeypatch, capsys, line, words):
-    other = tmp_path / "thesis.csv"
+    other, theirs = tmp_path / "thesis.csv", tmp_path / "theirs.csv"
     other.write_text("time,pos1\n")
-    names = {"run": file, "other": other}
+    theirs.write_text(THEIRS)
+    names = {"run": file, "other": other, "theirs": theirs}
     monkeypatch.setattr("sys.argv", ["jaxpend", "score", *line.format(**names).split()])
     with pytest.raises(SystemExit) as end:
         cli.main()
     out, err = capsys.readouterr()
     assert (end.value.code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith(f"jaxpend score: {words.format(**names)}")
-    assert other.read_text() == "time,pos1\n"
+    assert (other.read_text(), theirs.read_text()) == ("time,pos1\n", THEIRS)
 
 
 def test_a_run_that_is_saved_scores_the_same(tmp_path, capsys):

@@ -313,6 +313,9 @@ def test_noise_of_training_is_left_out():
     assert to_c.source(noisy) == to_c.source(policy(0))
 
 
+MINE = "# The controller of my thesis.\nfrom jaxpend.interop import c, numpy, onnx\n"
+
+
 @pytest.mark.parametrize(("to", "name"), [("numpy", "a.py"), ("c", "a-b.h"), ("onnx", "a.onnx")])
 def test_the_command_writes_a_file_that_it_may_write_again(monkeypatch, capsys, tmp_path, to, name):
     save_policy(tmp_path / "policy.npz", policy(0))
@@ -322,14 +325,14 @@ def test_the_command_writes_a_file_that_it_may_write_again(monkeypatch, capsys, 
         assert code == 0
         assert f"wrote {tmp_path / name}" in said
     assert (tmp_path / name).stat().st_size > 500
-    (tmp_path / name).write_text("mine")
+    (tmp_path / name).write_text(MINE)
     code, out, said = run(monkeypatch, capsys, line)
     assert (code, out) == (2, "")
     assert said == (
         f"jaxpend export: cannot write {tmp_path / name}: it is there and was not exported; choose "
         "another name\n"
     )
-    assert (tmp_path / name).read_text() == "mine"
+    assert (tmp_path / name).read_text() == MINE
 
 
 def run(monkeypatch, capsys, arguments):

@@ -30,9 +30,8 @@ sac
 snes gradient
 runs
 train
-interop
 report
-interop.gymnasium
+interop
 cli
 """
 RANK = {name: rank for rank, line in enumerate(LAYERS.split("\n")) for name in line.split()}

@@ -22,8 +22,7 @@ __all__ = ["COMMANDS", "Command", "function_of", "main", "one_sentence", "run"]
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """A subcommand; its function is that of its name in ``commands``, or of ``import``, since that
-    is a word of Python, ``import_``."""
+    """A subcommand; its function in ``commands`` has its name (see ``function_of``)."""
 
     group: str = ""
     summary: str = ""
@@ -152,7 +151,7 @@ def main(*prefix: str) -> NoReturn:
 
 
 def function_of(name: str) -> Callable[..., None]:
-    """The function behind a command."""
+    """The function behind a command; that of ``import``, a keyword of Python, is ``import_``."""
     commands = importlib.import_module(".commands", __package__)
     return getattr(commands, f"{name}_" if keyword.iskeyword(name) else name)
 

@@ -85,8 +85,8 @@ def report(
     Args:
         run: a run folder, finished or not, a folder of seeds, a policy or controller file, or
             acrobot or pendubot for the policy that ships with the package.
-        controller: judge this instead, as in jaxpend score: the known one around that policy,
-            or with module:name the file of your own classes; any, where RUN is a robot.
+        controller: as in jaxpend score: a known one, which is judged around the policy of RUN, or
+            module:name with the classes that its file needs. Where RUN is a robot, any one.
         out: folder for report.html and report/*.png; by default the run folder, or else
             runs/NAME.
         robustness: run the robustness benchmark too, seconds for every seed.

@@ -217,8 +217,8 @@ class Observer(Pytree):
         return (*memory[:3], jnp.clip(torque, -limit, limit).astype(memory[3].dtype))
 
 
-def surplus(plant: Plant, x: jax.Array) -> jax.Array:
-    """Energy () of state ``x`` (4,) above that of upright, J."""
+def energy_above_upright(plant: Plant, x: jax.Array) -> jax.Array:
+    """Energy () of state ``x`` (4,), J, beyond that of standing upright."""
     return total_energy(plant, x) - total_energy(plant, jnp.array(UPRIGHT, x.dtype))
 
 
@@ -242,7 +242,7 @@ class Rescue(Pytree):
         failed = (t > self.after) & self.away(x)
         if self.excess is None or self.plant is None:
             return failed
-        return failed | (surplus(self.plant, x) > self.excess)
+        return failed | (energy_above_upright(self.plant, x) > self.excess)
 
 
 @pytree
@@ -287,7 +287,7 @@ def _patient(main: Controller, plant: Plant, rescue: Rescue) -> Rescue:
     if not upright(x[-1]) or rescue.excess is None:
         return rescue
     late = DT * jnp.max(jnp.where(jax.vmap(rescue.away)(x), jnp.arange(len(x)), 0))
-    most = jax.vmap(surplus, (None, 0))(plant, x).max()
+    most = jax.vmap(energy_above_upright, (None, 0))(plant, x).max()
     return rescue.replace(
         after=jnp.maximum(rescue.after, MARGIN * late).astype(rescue.after.dtype),
         excess=jnp.maximum(rescue.excess, MARGIN * most).astype(rescue.excess.dtype),

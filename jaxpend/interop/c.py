@@ -45,6 +45,8 @@ NUMBERS = {"max": "{0} > {1} ? {0} : {1}", "min": "{0} < {1} ? {0} : {1}"}
 FUNCTIONS = {
     "sin": "sinf", "cos": "cosf", "tanh": "tanhf", "exp": "expf", "sqrt": "sqrtf", "log": "logf",
 }  # fmt: skip
+# What is computed along the rows of a matrix, by the operation of two arguments behind it.
+ROWS = {"total": "add", "largest": "max", "smallest": "min"}
 TYPES = {"float": "float", "int": "int", "bool": "int"}
 HELPERS = {
     "_int": """
@@ -268,7 +270,7 @@ def _lines(node: Node, names: dict[Node, str], prefix: str) -> list[str]:
         return lines
     if node.op == "matmul":
         return lines + _product(node, name, args)
-    if node.op in ("total", "largest", "smallest"):
+    if node.op in ROWS:
         return lines + _of_rows(node, name, args[0])
     if node.op == "take":
         index = node.args[1]
@@ -305,8 +307,7 @@ def _product(node: Node, name: str, args: list[str]) -> list[str]:
 
 def _of_rows(node: Node, name: str, arg: str) -> list[str]:
     m, k = node.value
-    form = {"total": "add", "largest": "max", "smallest": "min"}[node.op]
-    each = FORMS[form].format(f"{name}[r]", f"{arg}[r * {k} + i]")
+    each = FORMS[ROWS[node.op]].format(f"{name}[r]", f"{arg}[r * {k} + i]")
     return [
         f"for (int r = 0; r < {m}; ++r) {{",
         f"    {name}[r] = {arg}[r * {k}];",
@@ -323,7 +324,7 @@ def _counted(program: Program) -> tuple[int, str]:
         if node.op == "matmul":
             m, k, n = node.value
             work += 2 * m * k * n
-        elif node.op in ("total", "largest", "smallest"):
+        elif node.op in ROWS:
             work += node.value[0] * node.value[1]
         elif node.op in FUNCTIONS or node.op == "rem":
             calls[FUNCTIONS.get(node.op, "the remainder of a division")] += size

@@ -14,7 +14,7 @@ from ..env import Env, EnvState, restarted, truncated
 from ..plant import forward_kinematics
 from ..pytree import Pytree, pytree
 
-__all__ = ["Episode", "Functions", "Outcome", "compiled"]
+__all__ = ["Compiled", "Episode", "Outcome", "compiled"]
 
 
 @pytree
@@ -35,21 +35,23 @@ class Outcome(NamedTuple):
     over: jax.Array  # () bool
 
 
-class Functions(NamedTuple):
-    """What is compiled for an environment: of one, and of a batch."""
+class Compiled(NamedTuple):
+    """The functions of an environment: of one episode, and of a batch of them (n, ...)."""
 
-    begin: Callable  # keys' data -> Episode
+    begin: Callable  # data of a key (2,) -> Episode
     follow: Callable  # Episode -> Episode, the next one
-    step: Callable  # Episode, action -> Episode, Outcome
-    begin_all: Callable
-    follow_all: Callable
+    step: Callable  # Episode, action (1,) -> Episode, Outcome
+    begin_all: Callable  # data of keys (n, 2) -> Episode
+    follow_all: Callable  # Episode -> Episode, the next ones
+    # Episode, actions (n, 1) -> Episode, in which the next one has begun where one is over, its
+    # observations and true states, and the Outcome of before
     step_all: Callable
     points: Callable  # state (4,) -> (2, 2), see ``forward_kinematics``
 
 
 @cache
-def compiled(env: Env) -> Functions:
-    """Shared by all environments of the same configuration."""
+def compiled(env: Env) -> Compiled:
+    """What is compiled for an environment, shared by all of the same configuration."""
 
     def follow(key):
         key, key_now = jax.random.split(key)
@@ -66,7 +68,7 @@ def compiled(env: Env) -> Functions:
 
     def step_all(now, actions):
         after, outcome = jax.vmap(step)(now, actions)
-        # To begin is dear in random scenarios, and mostly nobody has to.
+        # To draw random scenarios is slow, and in most steps no episode is over.
         after = jax.lax.cond(
             outcome.over.any(),
             lambda: restarted(outcome.over, jax.vmap(follow)(after.key), after),
@@ -74,7 +76,7 @@ def compiled(env: Env) -> Functions:
         )
         return after, after.state.obs, after.state.x, outcome
 
-    return Functions(
+    return Compiled(
         begin=jax.jit(begin),
         follow=jax.jit(lambda now: follow(now.key)),
         step=jax.jit(step),

@@ -123,7 +123,7 @@ def _begun(episode: Episode | None) -> Episode:
 
 def _picture(env: Env, points: np.ndarray, trail: Sequence[np.ndarray], steps: int) -> np.ndarray:
     """A picture (height, width, 3), uint8."""
-    from ..report.animation import frame  # nobody else waits for matplotlib
+    from ..report.animation import frame  # which loads matplotlib, only to draw
 
     reach = float(np.sum(env.plant.length))
     image = frame(points, trail, reach, env.task.height, steps * env.config.dt)
@@ -162,6 +162,7 @@ class DoublePendulum(gymnasium.Env[np.ndarray, np.ndarray]):
         self._compiled = compiled(self.functions)
         self._episode: Episode | None = None
         self._steps = 0
+        self._points = np.zeros((2, 2))  # m, elbow and end effector now, if it is shown
         self._tips: deque[np.ndarray] = deque(maxlen=max(round(TRAIL / dt), 2))
         self._window: Any = None
         if render_mode == "human":
@@ -198,17 +199,18 @@ class DoublePendulum(gymnasium.Env[np.ndarray, np.ndarray]):
         return _array(seen.obs), float(seen.reward), False, bool(seen.over), info
 
     def _shown(self) -> None:
-        """Keep where the end effector is, and show it in the window where there is one."""
+        """Keep where the links are, and show them in the window where there is one."""
         if self.render_mode is None:
             return
-        self._tips.append(np.asarray(self._compiled.points(_begun(self._episode).state.x))[1])
+        self._points = np.asarray(self._compiled.points(_begun(self._episode).state.x))
+        self._tips.append(self._points[1])
         stride = max(round(1 / FPS / self.functions.config.dt), 1)
         if self._window is not None and self._steps % stride == 0:
             self._window.show(self._drawn(), stride * self.functions.config.dt)
 
     def _drawn(self) -> np.ndarray:
-        points = np.asarray(self._compiled.points(_begun(self._episode).state.x))
-        return _picture(self.functions, points, list(self._tips), self._steps)
+        _begun(self._episode)
+        return _picture(self.functions, self._points, list(self._tips), self._steps)
 
     def render(self) -> Any:
         """A picture (height, width, 3), uint8; in a window of its own None."""

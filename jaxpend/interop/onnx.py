@@ -67,8 +67,7 @@ class _Graph:
 
         self.helper, self.program = helper, program
         single = program.precision == "float32"
-        self.types = {"float": np.dtype(program.precision), "int": np.dtype("i8"),
-                      "bool": np.dtype("?")}  # fmt: skip
+        self.types = program.types
         self.tensors = {
             "float": TensorProto.FLOAT if single else TensorProto.DOUBLE,
             "int": TensorProto.INT64,
@@ -99,7 +98,7 @@ class _Graph:
             else:
                 self.put("Identity", [self.name(after[0])], name=f"next_s{number}")
         outputs.insert(0, info("torque", floats, [2]))
-        # Of a constant that a product reads as a matrix the flat form is not used.
+        # A constant that only products read is there as a matrix; nothing reads its flat form.
         used = {name for node in self.nodes for name in node.input} | {i.name for i in inputs}
         initial = [tensor for name, tensor in self.initializers.items() if name in used]
         graph = self.helper.make_graph(self.nodes, "controller", inputs, outputs, initial)

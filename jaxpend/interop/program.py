@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 __all__ = [
-    "FOLDS",
     "KINDS",
     "Builder",
     "Leaf",
@@ -63,6 +62,11 @@ class Program:
     state: tuple[Leaf, ...]
     next_state: tuple[tuple[Node, ...], ...]  # of a leaf: its entries, or one vector
     torque: tuple[Node, Node]  # N m
+
+    @property
+    def types(self) -> dict[str, np.dtype]:
+        """The type in numpy of every kind of node."""
+        return _types_of(self.precision)
 
     @property
     def outputs(self) -> tuple[Node, ...]:
@@ -113,8 +117,8 @@ def named(
     Args:
         nodes: in order.
         literal: writes a number.
-        leaf: the form of the name of a leaf of the state, of its number.
-        entry: of an entry, of the name of the leaf, or ``x``, and its number.
+        leaf: the name of a leaf of the state, with {} for its number.
+        entry: the name of an entry, with {} for the leaf or ``x``, and {} for its number.
     """
     names = {}
     for count, node in enumerate(nodes):
@@ -142,14 +146,10 @@ def is_range(node: Node) -> bool:
     return whole and bool((np.diff(node.value) == 1).all())
 
 
-def to_int(a: Any) -> np.ndarray:
-    """Towards zero, at most what 32 bits hold; 0 of NaN. So have jax and all printers it."""
+def _to_int(a: Any) -> np.ndarray:
+    """Towards zero, at most what 32 bits hold; 0 of NaN: as jax and all printers convert."""
     limits = np.iinfo(np.int32)
     return np.clip(np.nan_to_num(a), limits.min, limits.max).astype(np.int64)
-
-
-def _where(condition, then, otherwise):
-    return np.where(condition, then, otherwise)
 
 
 # Operations entry by entry: how they are computed where all arguments are constants.
@@ -160,7 +160,7 @@ FOLDS: dict[str, Callable] = {
     "log": np.log, "sin": np.sin, "cos": np.cos, "tanh": np.tanh, "finite": np.isfinite,
     "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal,
     "eq": np.equal, "ne": np.not_equal, "and": np.logical_and, "or": np.logical_or,
-    "not": np.logical_not, "select": _where, "int": to_int, "float": np.float64,
+    "not": np.logical_not, "select": np.where, "int": _to_int, "float": np.float64,
     "bool": np.bool_, "idiv": lambda a, b: np.trunc(a / b).astype(np.int64),
 }  # fmt: skip
 BOOLEAN = {"lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "finite", "bool"}
@@ -168,11 +168,15 @@ BOOLEAN = {"lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "finite", "bo
 KINDS = {"f": "float", "i": "int", "u": "int", "b": "bool"}
 
 
+def _types_of(precision: str) -> dict[str, np.dtype]:
+    return {"float": np.dtype(precision), "int": np.dtype("i8"), "bool": np.dtype("?")}
+
+
 class Builder:
     """Makes nodes: one for equal values, a constant where all arguments are."""
 
     def __init__(self, precision: str):
-        self.types = {"float": np.dtype(precision), "int": np.dtype("i8"), "bool": np.dtype("?")}
+        self.types = _types_of(precision)
         self._known: dict[Any, Node] = {}
 
     def node(self, op: str, args: tuple[Node, ...] = (), kind: str = "float",

@@ -26,16 +26,14 @@ SAME = {
 }  # fmt: skip
 # Jaxprs in a jaxpr, and the parameter that holds them.
 CALLS = {
-    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat": "jaxpr",
-    "checkpoint": "jaxpr", "remat2": "jaxpr",
+    "jit": "jaxpr", "remat2": "jaxpr", "closed_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr",
 }  # fmt: skip
-IDENTITIES = ("optimization_barrier", "copy", "copy_p", "stop_gradient")
+IDENTITIES = ("optimization_barrier", "copy", "stop_gradient")
 # The result has entries of the argument, wherever they come from.
 MOVES: dict[str, Callable[[np.ndarray, Params], np.ndarray]] = {
     "reshape": lambda a, p: a.reshape(p["new_sizes"]),
     "squeeze": lambda a, p: a.squeeze(tuple(p["dimensions"])),
-    "expand_dims": lambda a, p: np.expand_dims(a, p["dimensions"]),
     "transpose": lambda a, p: a.transpose(p["permutation"]),
     "rev": lambda a, p: np.flip(a, p["dimensions"]),
     "broadcast_in_dim": lambda a, p: _broadcast(a, p["shape"], p["broadcast_dimensions"]),
@@ -264,7 +262,9 @@ def _pad(tr, args, p, shape):
 @rule("dynamic_slice")
 def _dynamic_slice(tr, args, p, shape):
     operand, *starts = args
-    return _window(tr, operand, range(len(starts)), starts, p["slice_sizes"], shape)
+    starts = [tr.move(start, lambda a: np.broadcast_to(a, shape)) for start in starts]
+    within = _offsets(operand.shape, p["slice_sizes"]).reshape(shape)
+    return _looked_up(tr, operand, range(len(starts)), starts, p["slice_sizes"], within)
 
 
 @rule("gather")
@@ -298,12 +298,6 @@ def _offsets(shape: Shape, sizes: Sequence[int]) -> np.ndarray:
     """Where the entries of a slice are in a flat array of that shape, from its first one on."""
     numbers = np.arange(int(np.prod(shape))).reshape(shape)
     return numbers[tuple(map(slice, sizes))]
-
-
-def _window(tr, operand, axes, starts, sizes, shape) -> Array:
-    starts = [tr.move(start, lambda a: np.broadcast_to(a, shape)) for start in starts]
-    within = _offsets(operand.shape, sizes).reshape(shape)
-    return _looked_up(tr, operand, axes, starts, sizes, within)
 
 
 def _looked_up(tr, operand, axes, starts, sizes, within) -> Array:

@@ -48,7 +48,7 @@ def _product(tr: Translator, a: Array, b: Array, sizes: tuple[int, int, int]) ->
 
 
 def reduced(tr: Translator, a: Array, op: str, axes: Sequence[int], shape: Shape) -> Array:
-    """An operation of two arguments through all entries along some axes."""
+    """The entries along some axes combined by an operation of two arguments, such as ``add``."""
     kept = [axis for axis in range(len(a.shape)) if axis not in axes]
     k = int(np.prod([a.shape[axis] for axis in axes]))
     m = a.size // max(k, 1)
@@ -59,13 +59,14 @@ def reduced(tr: Translator, a: Array, op: str, axes: Sequence[int], shape: Shape
 
 
 def _taken_apart(tr: Translator, a: Array) -> np.ndarray:
+    """Its scalars. Raises ``JaxpendError`` if they are too many to be written one by one."""
     if a.size > PART and not a.small:
         raise tr.refuse(f"it looks for one of {a.size} numbers, or sums them step by step")
     return tr.scalars(a)
 
 
 def position(tr: Translator, a: Array, better: str, axes: Sequence[int], shape: Shape) -> Array:
-    """Of the first largest or smallest entry along an axis."""
+    """Where along an axis the first largest (``better`` is "gt") or smallest ("lt") entry is."""
     rows = tr.move(a, lambda v: np.moveaxis(v, axes[0], -1).reshape(-1, v.shape[axes[0]]))
     found = []
     for row in _taken_apart(tr, rows):
@@ -79,7 +80,7 @@ def position(tr: Translator, a: Array, better: str, axes: Sequence[int], shape: 
 
 
 def running(tr: Translator, a: Array, op: str, axis: int, reverse: bool) -> Array:
-    """The same, but all that it is on the way, along one axis."""
+    """As ``reduced`` along one axis, with all that comes before the result: a cumulative sum."""
     lines = np.moveaxis(_taken_apart(tr, a), axis, -1)
     found = np.empty(lines.shape, object)
     for line in np.ndindex(lines.shape[:-1]):

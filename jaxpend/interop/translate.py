@@ -119,7 +119,7 @@ class Translator:
         return Array.of_scalars(entries, array.shape).content
 
     def made(self, vector: Node, shape: Sequence[int]) -> Array:
-        """The array of a flat vector."""
+        """The array of that shape with the entries of a flat vector, taken apart if it is small."""
         array = Array(tuple(shape), vector)
         return Array(array.shape, self.scalars(array)) if array.size <= SMALL else array
 
@@ -169,7 +169,7 @@ class Translator:
         return self.made(vector, joined.shape)
 
     def chain(self, name: str, scalars: Sequence[Node]) -> Node:
-        """An operation of two arguments through some scalars, from the first on."""
+        """Scalars combined, one after the other, by an operation of two arguments."""
         result = scalars[0]
         for scalar in scalars[1:]:
             result = self.build.op(name, result, scalar)

@@ -21,7 +21,7 @@ class Transition(Pytree):
     next_obs: jax.Array  # (..., obs_size), the true next ones, also where an episode was cut
     next_privileged: jax.Array  # (..., privileged_size)
     wanted: jax.Array | None = None  # (...,) the action that a demonstration asks for
-    # (...,) of the value of the next state, where the reward is that of several steps.
+    # (...,) factor of the value of the next state; None: that of one step.
     discount: jax.Array | None = None
 
     @classmethod
@@ -44,7 +44,8 @@ class Replay(Pytree):
 def init(like: Transition, times: int, environments: int, *, steps: int = 1) -> Replay:
     """An empty buffer for transitions of the shapes and types of ``like``, one environment's.
 
-    For ``sample_steps`` it is to say that it will be asked for more than one step.
+    ``sample_steps`` can give transitions of several steps where ``steps`` is more than 1: it takes
+    memory of where episodes ended.
     """
     shape, zero = (times, environments), jnp.zeros((), jnp.int32)
     data = jax.tree.map(lambda v: jnp.zeros(shape + v.shape, v.dtype), like)
@@ -92,7 +93,7 @@ def sample_steps(
 
     The reward is the discounted sum of theirs, the next state that of the last one, and
     ``discount`` what its value counts (Sutton, "Learning to predict by the methods of temporal
-    differences", 1988). ``key`` is consumed.
+    differences", 1988). ``key`` is consumed. The buffer must be one of several steps (``init``).
     """
     times, environments = replay.data.action.shape
     key_time, key_environment = jax.random.split(key)
