@@ -120,7 +120,7 @@ def _check_call(structure: Any, forms: tuple[tuple[Any, Any], ...], _precision: 
         shape = getattr(torque, "shape", type(torque).__name__)
         raise JaxpendError(f"{name} returns a torque of shape {shape}; it must be (2,)")
     memories = [
-        (jax.tree.structure(tree), [leaf.shape for leaf in jax.tree.leaves(tree)])
+        (jax.tree.structure(tree), [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)])
         for tree in (carry, after)
     ]
     if memories[0] != memories[1]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from .errors import JaxpendError
-from .fields import Checked, Natural, Positive
+from .fields import Bounds, Checked, Positive, Scale
 
 if TYPE_CHECKING:
     import jax
@@ -69,10 +69,11 @@ class Observation(Checked):
     """
 
     kind: Literal["wrapped", "sincos", "sincos_clipped", "state"] = "sincos"
-    max_velocity: Positive = 20.0  # rad/s, velocities are divided by it
-    history: Natural = 0  # past states and actions that are seen too, one control period apart
+    max_velocity: Scale = 20.0  # rad/s, velocities are divided by it
+    # Past states and actions that are seen too, one control period apart.
+    history: Annotated[int, Bounds(least=0, most=1000)] = 0
     mean: tuple[float, ...] | None = None  # of what is seen of a state; None: 0
-    std: tuple[Positive, ...] | None = None  # standard deviations; None: 1
+    std: tuple[Scale, ...] | None = None  # standard deviations; None: 1
     clip: Positive | None = None  # largest magnitude of what is seen, once normalised; None: any
 
     def __post_init__(self) -> None:

@@ -159,7 +159,11 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
             must be regular, on another time grid.
     """
     task = board(judged_on).task
-    t, u = np.asarray(run.t, float), np.asarray(run.u, float)
+    t, x, u = (np.asarray(values, float) for values in (run.t, run.x, run.u))
+    count = len(t) if t.ndim == 1 else 0
+    if count < 3 or u.shape not in ((count, 2), (count - 1, 2)) or x.shape != (count, 4):
+        shapes = f"t {t.shape}, x {x.shape}, u {u.shape}"
+        raise JaxpendError(f"the run has {shapes}; it must have three or more (N,), (N, 4), (N, 2)")
     if (last := float(t[-1])) > 1.01 * task.duration:
         raise JaxpendError(
             f"the run lasts {last:.7g} s; a run of this board lasts {task.duration:g}"

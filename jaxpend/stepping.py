@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .errors import JaxpendError
+from .fields import Positive, Seed, checked
 from .pytree import Pytree
 from .scenario import DT
 
@@ -58,7 +59,10 @@ def _of_type(controller: Any, dtype: Any) -> Any:
 def _numbers(values: ArrayLike, shape: tuple[int, ...], what: str, dtype: Any) -> np.ndarray:
     """Finite numbers of that shape. Raises ``JaxpendError`` for anything else."""
     try:
-        array = np.asarray(values, dtype)
+        if np.iscomplexobj(values):
+            raise TypeError
+        with np.errstate(over="ignore"):  # what is too large is infinite
+            array = np.asarray(values, dtype)
     except (TypeError, ValueError, OverflowError):
         kind = type(values).__name__
         raise JaxpendError(f"{what} is a {kind}; it must be numbers of shape {shape}") from None
@@ -84,11 +88,12 @@ class Stepper:
             seed: of a controller that draws something.
 
         Raises:
-            JaxpendError: dt is not positive.
+            JaxpendError: dt is not positive, seed is no seed, or it is no controller.
         """
-        if not 0 < dt < np.inf:
-            raise JaxpendError(f"dt = {dt} s must be positive and finite")
-        self.dt, self.seed = float(dt), seed
+        if isinstance(controller, type) or not callable(getattr(controller, "reset", None)):
+            text = "no controller; a controller has reset(key) and __call__(carry, t, x)"
+            raise JaxpendError(f"{controller!r:.40} is {text}")
+        self.dt, self.seed = checked(Positive, dt, "dt"), checked(Seed, seed, "seed")
         self._dtype = jnp.result_type(float)
         self._x64 = bool(self._dtype == jnp.float64)
         self._controller = _of_type(controller, self._dtype)

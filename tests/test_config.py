@@ -118,6 +118,8 @@ def test_every_text_is_free_or_one_of_a_few():
         (lambda: Observation(mean=(math.nan,) * 6), "values, each of which must be a number"),
         (lambda: Observation(clip=0.0), "clip is 0.0; it must be positive"),
         (lambda: Observation(history=-1), "history is -1; it must not be negative"),
+        (lambda: Observation(history=10**9), "history is 1000000000; it must be at most 1,000"),
+        (lambda: Observation(std=(1e-300,) * 6), "each of which must be at least 1e-09"),
         (lambda: SNESConfig(population=1), "population is 1; it must be at least 2"),
         (lambda: SNESConfig(strategy="open_es", population=5), "open_es needs pairs"),
         (lambda: Search(horizons=(1.2, 3.0)), "not be shorter than the longest of horizons"),

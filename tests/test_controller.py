@@ -166,3 +166,16 @@ def test_trivial_controllers():
     for controller in (Zero(), Feedback(lambda t, x: x[:2] * 0)):
         assert not np.any(rollout(PLANT, controller, KEY, duration=0.03).u)
     assert dataclasses.is_dataclass(Zero)
+
+
+@pytree
+class Widening(Strange):
+    """Its memory is of 16 bits at first."""
+
+    def reset(self, key):
+        return jnp.zeros(2, jnp.float16)
+
+
+def test_a_memory_of_another_type_is_refused():
+    with refused("a memory of another form"):
+        check_controller(Widening(ONES, lambda self, carry, x: (carry + x[:2], self.gain)))

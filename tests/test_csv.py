@@ -130,6 +130,8 @@ def grid(**changes):
     [
         (grid(t=0.001 * np.arange(5000)), True, "has a step of 0.001 s; a simulated run of this"),
         (grid(t=1 + 0.001 * np.arange(5000)), True, "the run starts at 1 s and has"),
+        (grid(u=np.ones((5000, 3))), False, "the run has t (5000,), x (5000, 4), u (5000, 3); it"),
+        (grid(x=np.zeros((3, 4))), False, "the run has t (5000,), x (3, 4), u (5000, 2); it must"),
         (grid(t=1e300 * np.arange(5000)), False, "the run lasts 4.999e+303 s; a run of this boa"),
         (grid(t=0.01 * np.arange(5000)), False, "the run lasts 49.99 s; a run of this board last"),
         (grid(u=np.ones((5000, 2))), True, "joint 2 has torques of up to 1 N m, but the pendubot"),

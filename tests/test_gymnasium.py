@@ -128,6 +128,9 @@ def test_bad_arguments_are_one_sentence(kind, fields, words):
         (0.5, "the action has shape (); it must have (1,)"),
         (np.zeros((1, 1)), "the action has shape (1, 1); it must have (1,)"),
         ([float("nan")], "an action is not finite"),
+        ([1e300], "an action is not finite"),
+        ([10**400], "; it must be numbers in [-1, 1]"),
+        ([1j], "an action is [1j]; it must be numbers in [-1, 1]"),
         (["up"], "an action is ['up']; it must be numbers in [-1, 1]"),
     ],
 )
@@ -144,6 +147,9 @@ def test_what_resets_badly_is_one_sentence():
     with refused("options of reset are state; there are none"):
         DoublePendulum().reset(options={"state": 0})
     envs = VectorDoublePendulum(num_envs=3)
+    for seed in ("ab", [1, None, 2], 1.5):
+        with refused(f"seed is {seed!r}; it must be integers that are not negative"):
+            envs.reset(seed=seed)
     with refused("there are 2 seeds; there must be 3"):
         envs.reset(seed=[1, 2])
     with refused("there is no episode yet"):

@@ -138,5 +138,29 @@ def test_what_is_no_time_is_refused():
     with refused("t is nan; its numbers must be finite"):
         law.torque(np.zeros(4), np.nan)
     for dt in (0, -1, np.inf, np.nan):
-        with refused(f"dt = {dt} s must be positive and finite"):
+        with refused(f"dt is {float(dt)}; it must be "):
             law.start(dt=dt)
+
+
+@pytest.mark.parametrize(
+    ("start", "words"),
+    [
+        (lambda: Stepper(3), "3 is no controller; a controller has reset(key)"),
+        (lambda: Stepper(Policy), "is no controller"),
+        (lambda: shipped_network().start(dt="a"), "dt is 'a'; it must be a number"),
+        (lambda: shipped_network().start(dt=1j), "dt is 1j; it must be a number"),
+        (lambda: shipped_network().start(seed=1.5), "seed is 1.5; it must be an integer"),
+        (
+            lambda: shipped_network().start(seed=2**70),
+            "seed is 1180591620717411303424; it must be ",
+        ),
+        (
+            lambda: shipped_network().torque(np.full(4, 1j)),
+            "x is a ndarray; it must be numbers of shape (4,)",
+        ),
+        (lambda: shipped_network().torque(np.full(4, 1e300)), "its numbers must be finite"),
+    ],
+)
+def test_what_cannot_be_started_or_called_is_refused(start, words):
+    with refused(words):
+        start()

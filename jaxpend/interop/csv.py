@@ -130,7 +130,7 @@ def save_csv(path: str | Path, run: Trajectory) -> None:
     """
     check_target(path)
     u = np.asarray(run.u, float)
-    if u.ndim != 2:
+    if u.ndim != 2 or u.shape[1] != 2:
         raise JaxpendError(f"the torques have shape {u.shape}; a file holds one run, (N, 2)")
     t, x = np.asarray(run.t, float)[: len(u)], np.asarray(run.x, float)[: len(u)]
     lines = io.StringIO()

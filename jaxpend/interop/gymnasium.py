@@ -99,8 +99,11 @@ def _array(values: Any) -> np.ndarray:
 def _actions(values: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Actions as float32. Raises ``JaxpendError`` for another shape, or what is not a number."""
     try:
-        actions = np.asarray(values, np.float32)
-    except (TypeError, ValueError):
+        if np.iscomplexobj(values):
+            raise TypeError
+        with np.errstate(over="ignore"):  # what is too large is infinite
+            actions = np.asarray(values, np.float32)
+    except (TypeError, ValueError, OverflowError):
         raise JaxpendError(f"an action is {values!r}; it must be numbers in [-1, 1]") from None
     if actions.shape != shape:
         raise JaxpendError(f"the action has shape {actions.shape}; it must have {shape}")
@@ -111,7 +114,7 @@ def _actions(values: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 def _no_options(options: dict[str, Any] | None) -> None:
     if options:
-        names = ", ".join(map(str, options))
+        names = ", ".join(map(str, options)) if isinstance(options, dict) else repr(options)
         raise JaxpendError(f"options of reset are {names}; there are none, leave them out")
 
 
@@ -290,7 +293,9 @@ class VectorDoublePendulum(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             first = int(self.np_random.integers(2**31)) if seed is None else int(seed)
             seeds: Sequence[int] = range(first, first + self.num_envs)
         else:
-            seeds = seed
+            seeds = seed if isinstance(seed, Sequence | np.ndarray) else [seed]
+        if not all(isinstance(s, int | np.integer) and s >= 0 for s in seeds):
+            raise JaxpendError(f"seed is {seed!r}; it must be integers that are not negative")
         if len(seeds) != self.num_envs:
             raise JaxpendError(f"there are {len(seeds)} seeds; there must be {self.num_envs}")
         if seed is None and self._episodes is not None:
