@@ -167,7 +167,8 @@ def test_what_a_policy_does_where_it_stands_is_retained(monkeypatch):
     assert gradient.change(start, fell, KEY) < 1e-9
 
 
-def test_retention_pulls_back_to_what_the_start_did():
+def test_retention_pulls_back_to_what_the_start_did(monkeypatch):
+    monkeypatch.setattr(gradient, "SHOWN", 8)
     start = shipped_network()
     config = GradientConfig(steps=30, retention=1e4, duration=0.02, learning_rate=1e-3)
     begun = gradient.init(config, start, KEY, TASK)

@@ -17,7 +17,7 @@ OPTIONS = f"""
     --sac.env.observation.history 2 --sac.env.randomised 0.5
     --sac.demonstrations.episodes 2 --sac.demonstrations.duration 1
     --sac.demonstrations.updates 20_000 --sac.demonstrations.batch-size 32
-    --snes.generations 12 --snes.population 4 --snes.chunk 1
+    --guard.no-rescue --snes.generations 12 --snes.population 4 --snes.chunk 1
 """.split()
 
 

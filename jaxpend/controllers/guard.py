@@ -283,21 +283,23 @@ def _patient(main: Controller, plant: Plant, rescue: Rescue) -> Rescue:
 
     A swing-up that works is not interrupted, however slow it is.
     """
-    x = _alone(main, plant)
-    if not upright(x[-1]) or rescue.excess is None:
-        return rescue
-    late = DT * jnp.max(jnp.where(jax.vmap(rescue.away)(x), jnp.arange(len(x)), 0))
-    most = jax.vmap(energy_above_upright, (None, 0))(plant, x).max()
-    return rescue.replace(
-        after=jnp.maximum(rescue.after, MARGIN * late).astype(rescue.after.dtype),
-        excess=jnp.maximum(rescue.excess, MARGIN * most).astype(rescue.excess.dtype),
-    )
+    after, excess = _needed(main, plant, rescue)
+    return rescue.replace(after=after, excess=excess)
 
 
 @jax.jit
-def _alone(main: Controller, plant: Plant) -> jax.Array:
-    """True states of a run on the nominal plant."""
-    return rollout(plant, main, jax.random.key(0)).x
+def _needed(main: Controller, plant: Plant, rescue: Rescue) -> tuple[jax.Array, jax.Array]:
+    """``after`` and ``excess`` of a rescue, or more if a run on the nominal plant stands so."""
+    x = rollout(plant, main, jax.random.key(0)).x
+    late = DT * jnp.max(jnp.where(jax.vmap(rescue.away)(x), jnp.arange(len(x)), 0))
+    most = jax.vmap(energy_above_upright, (None, 0))(plant, x).max()
+
+    def more(limit: jax.Array, needed: jax.Array) -> jax.Array:
+        grown = jnp.maximum(limit, MARGIN * needed).astype(limit.dtype)
+        return jnp.where(upright(x[-1]), grown, limit)
+
+    assert rescue.excess is not None
+    return more(rescue.after, late), more(rescue.excess, most)
 
 
 def guard(
