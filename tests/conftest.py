@@ -41,8 +41,9 @@ XLA = (
 )
 # These files take longest, and a file is one worker's: begun first, none of them is waited for.
 LONG = (
-    "test_resume", "test_hostile", "test_cli", "test_controllers", "test_stages", "test_guard",
-    "test_gradient", "test_snes", "test_train", "test_tutorial", "test_leaderboard", "test_export",
+    "test_train", "test_report", "test_gradient", "test_sac", "test_guard", "test_snes",
+    "test_controller", "test_controllers", "test_demonstrations", "test_resume", "test_robustness",
+    "test_tutorial", "test_env", "test_cli", "test_export", "test_ilqr", "test_stages",
 )  # fmt: skip
 
 

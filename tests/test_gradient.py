@@ -191,7 +191,7 @@ def test_retention_is_of_a_policy_alone():
 
 
 def test_jitted_as_eager():
-    start, config = network(), GradientConfig(duration=0.1)
+    start, config = network(), GradientConfig(duration=0.04)
     arguments = config, start, TASK, coordinates(start)[0], KEY
     eager, _, metrics = gradient.slope(*arguments)
     jitted, _, expected = jax.jit(gradient.slope, static_argnums=(0, 2))(*arguments)

@@ -352,7 +352,7 @@ def test_the_greedy_policy_is_that_of_the_averaged_actor():
     state = sac.init(agent, KEY)
     rows = np.random.default_rng(0).uniform(-1, 1, (64, 2 * 7 + 2))
     batch, before = transitions(rows, 6), state.average
-    after, _ = sac.update(agent, state, batch, KEY)
+    after, _ = update(agent, state, batch, KEY)
     expected = jax.tree.map(lambda old, new: 0.75 * old + 0.25 * new, before, after.actor)
     jax.tree.map(lambda a, b: assert_close(a, b), after.average, expected)
     assert not leaves_equal(after.average, after.actor)

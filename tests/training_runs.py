@@ -16,7 +16,7 @@ OPTIONS = f"""
     --sac.batch-size 32 --sac.replay-capacity 128 --sac.critic-hidden 8 --sac.actor-hidden 8
     --sac.env.observation.history 2 --sac.env.randomised 0.5
     --sac.demonstrations.episodes 2 --sac.demonstrations.duration 1
-    --sac.demonstrations.updates 20_000 --sac.demonstrations.batch-size 32
+    --sac.demonstrations.updates 10_000 --sac.demonstrations.batch-size 32
     --guard.no-rescue --snes.generations 12 --snes.population 4 --snes.chunk 1
 """.split()
 
