@@ -97,9 +97,7 @@ def train(robot: str, seed: int, steps: int, chunk: int, path: Path) -> Iterator
         agent_kwargs={"activation": recipe.activation, "hidden_layer_sizes": recipe.actor_hidden},
         num_envs=recipe.num_envs, num_epochs=recipe.updates_per_step, buffer_size=400_000,
         fill_buffer=recipe.warmup_steps, batch_size=recipe.batch_size, gamma=recipe.discount,
-        learning_rate=recipe.learning_rate,
-        # Its targets move once a step of all environments, ours once an update.
-        polyak=(1 - recipe.target_rate) ** recipe.updates_per_step,
+        learning_rate=recipe.learning_rate, polyak=1 - recipe.target_rate,
         total_timesteps=chunk, eval_freq=chunk, skip_initial_evaluation=True,
     ).replace(eval_callback=lambda *_: ())  # fmt: skip
     advance = jax.jit(lambda state: algorithm.train(train_state=state)[0])
