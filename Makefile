@@ -32,7 +32,7 @@ $(STAMP): pyproject.toml .constraints.txt
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and \
 	  f"jaxpend needs Python 3.11 or newer, not {v[0]}.{v[1]}: make PYTHON=/path/to/python3")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c .constraints.txt -e '.[dev]'
+	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check -c .constraints.txt -e '.[dev]'
 	@touch $@
 
 install: $(STAMP)  ## make .venv with pinned versions
