@@ -38,7 +38,6 @@ from jaxpend.interop.gymnasium import NAMES
 
 HERE = Path(__file__).parent
 NAMED = ("stable-baselines3", "gymnasium", "torch", "jax")
-SHARE = 0.5  # of the recipe's steps
 
 
 class Environments(VecEnv):
@@ -136,7 +135,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--robot", default="pendubot", choices=ROBOTS)
     parser.add_argument("--seed", type=int, default=0)
-    steps = round(SHARE * load_config(TrainRun(), "plain").sac.steps)
+    steps = load_config(TrainRun(), "plain").sac.steps
     parser.add_argument("--steps", type=int, default=steps, help="environment steps")
     parser.add_argument("--chunk", type=int, default=64_000, help="steps between judgements")
     args = parser.parse_args()

@@ -10,6 +10,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
+import onnx
 import pytest
 from conftest import refused, task_of
 
@@ -333,6 +334,24 @@ def test_the_command_writes_a_file_that_it_may_write_again(monkeypatch, capsys, 
         "another name\n"
     )
     assert (tmp_path / name).read_text() == MINE
+
+
+def test_the_command_exports_in_either_precision(monkeypatch, capsys, tmp_path):
+    save_policy(tmp_path / "policy.npz", policy(0))
+    line = ["export", str(tmp_path / "policy.npz"), "--precision"]
+    for precision, kind, number in (("float32", "float", 1), ("float64", "double", 11)):
+        for to in ("c", "onnx"):
+            out = ["--to", to, "--out", str(tmp_path / f"{precision}.{to}")]
+            assert run(monkeypatch, capsys, [*line, precision, *out])[0] == 0
+        said = (tmp_path / f"{precision}.c").read_text()
+        assert f"_step({precision}_state *s, {kind} t, const {kind} x[4]" in said
+        graph = onnx.load_model(tmp_path / f"{precision}.onnx").graph
+        assert {i.type.tensor_type.elem_type for i in graph.input} == {number}
+    for to in ("numpy", "realaigym"):
+        out = ["--to", to, "--out", str(tmp_path / to)]
+        code, _, said = run(monkeypatch, capsys, [*line, "float32", *out])
+        assert code == 2
+        assert f"--precision is float32; {to} computes in float64" in said
 
 
 def run(monkeypatch, capsys, arguments):
