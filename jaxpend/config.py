@@ -149,9 +149,7 @@ class SACConfig(Checked):
     """Hyperparameters of SAC."""
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
-    steps: Count = 600_000  # environment steps, all environments together, of an attempt
-    # Trainings from scratch; the gradient compares their best policies and goes on with one.
-    attempts: Annotated[int, Bounds(least=1, most=100)] = 1
+    steps: Count = 600_000  # environment steps, all environments together
     num_envs: Count = 32
     updates_per_step: Count = 4  # gradient updates per vector step (num_envs environment steps)
     batch_size: Count = 256
@@ -178,15 +176,16 @@ class SACConfig(Checked):
     actor_delay: Natural = 0  # environment steps before the actor learns; the critics start at once
     eval_every: Count = 25_000  # environment steps between judgements by the official score
     objective: Objective = dataclasses.field(default_factory=Objective)  # of which policy is best
+    # Of the policies that are judged the best so many go on; the gradient lets them compete.
+    contestants: Annotated[int, Bounds(least=1, most=100)] = 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.replay_capacity < self.num_envs * self.n_step:
             text = f"it must hold n_step = {self.n_step} steps of all {self.num_envs} environments"
             raise JaxpendError(f"replay_capacity is {self.replay_capacity}; {text}")
-        for name in ("n_step", "attempts"):
-            if (number := getattr(self, name)) > 1 and self.demonstrations.episodes:
-                raise JaxpendError(f"{name} is {number}; with demonstrations it must be 1")
+        if self.n_step > 1 and self.demonstrations.episodes:
+            raise JaxpendError(f"n_step is {self.n_step}; with demonstrations it must be 1")
         if self.mirror and not self.env.observation.symmetric:
             text = "mirror is on, but the mean of the observation is not the same left and right"
             raise JaxpendError(f"{text}; turn mirror off")

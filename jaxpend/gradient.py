@@ -290,8 +290,8 @@ class Gradient(SearchStage):
         config = getattr(run, "gradient", None)
         if not (config and config.steps):
             return None
-        if isinstance(run, TrainRun) and run.sac.attempts > 1:
-            return Contest(config, start, task, run.sac.attempts)
+        if isinstance(run, TrainRun) and run.sac.contestants > 1:
+            return Contest(config, start, task, run.sac.contestants)
         return cls(config, start, task)
 
     def begin(self, seed: int, controller: Controller) -> SearchState:

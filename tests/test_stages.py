@@ -14,7 +14,6 @@ from training_runs import events_of, rows_of
 from jaxpend import Policy, save_policy, stage
 from jaxpend.boards import v2
 from jaxpend.config import (
-    DemonstrationConfig,
     GradientConfig,
     Objective,
     SACConfig,
@@ -27,7 +26,7 @@ from jaxpend.gradient import Contest, Gradient
 from jaxpend.pytree import Pytree, pytree
 from jaxpend.report import page
 from jaxpend.runs.reader import find, listing, remarks
-from jaxpend.sac.stage import SAC, Attempts, chunk_length
+from jaxpend.sac.stage import SAC, Contestants, chunk_length
 from jaxpend.score import Criteria, nominal, score_v2
 from jaxpend.snes import SNES
 from jaxpend.train import train
@@ -234,35 +233,36 @@ def test_chunks_are_of_one_length_where_they_can_be():
     assert chunk_length(5, 1) == 1
 
 
-# --- attempts and contests -----------------------------------------------------------------
+# --- contests ------------------------------------------------------------------------------
 
 
-def test_attempts_begin_anew_and_the_best_policy_of_each_goes_on(monkeypatch):
+def test_the_best_of_the_judged_policies_go_on(monkeypatch):
     config = SACConfig(
-        steps=8, num_envs=4, attempts=2, eval_every=4, replay_capacity=64, warmup_steps=100,
-        actor_hidden=(4,), critic_hidden=(4,),
+        steps=16, num_envs=4, contestants=2, eval_every=4, replay_capacity=64, warmup_steps=4,
+        batch_size=4, updates_per_step=1, actor_hidden=(4,), critic_hidden=(4,),
     )  # fmt: skip
-    worths = iter([0.1, 0.5, 0.2, 0.3, 0.9])  # at the start, then twice an attempt
+    worths = iter([0.1, 0.5, 0.2, 0.3, 0.3])  # at the start, then after each step
     monkeypatch.setattr("jaxpend.sac.stage.value", lambda *rest: next(worths))
     search = SAC.of(SACRun(sac=config), None, TASK)
-    assert (type(search), search.total) == (Attempts, 16)
+    assert (type(search), search.total) == (Contestants, 16)
     state = search.start(0, None)
     search.judge(state, {})
-    seen = []
+    seen, policies = [], []
     while search.done(state) < search.total:
         [(state, row)] = search.advance([state])
         _, [(last, worth)] = search.judge(state, row)
-        seen.append((search.done(state), row["attempt"], worth, last))
-    assert [entry[:3] for entry in seen] == [(4, 1, 0.5), (8, 1, 0.2), (12, 2, 0.3), (16, 2, 0.9)]
-    first, second = (seen[i][3].layers[0][0] for i in (0, 3))
-    assert not np.array_equal(first, second)  # a key of its own
-    np.testing.assert_allclose(state.worths, [0.5, 0.9])
+        seen.append((search.done(state), worth))
+        policies.append(last)
+    assert seen == [(4, 0.5), (8, 0.2), (12, 0.3), (16, 0.3)]
+    np.testing.assert_allclose(sorted(state.worths), [0.3, 0.5])
     best = search.outcome(state, None)
-    np.testing.assert_array_equal(best[0].layers[0][0], second)
-    np.testing.assert_array_equal(best[1].layers[0][0], first)
+    first, _, _, tied = (policy.layers[0][0] for policy in policies)
+    assert not np.array_equal(first, tied)
+    np.testing.assert_array_equal(best[0].layers[0][0], first)
+    np.testing.assert_array_equal(best[1].layers[0][0], tied)  # the later one has learned more
     # What goes on from one controller takes the best.
     after = SNES(SNESConfig(population=2), shipped_network(), TASK).start(0, best)
-    np.testing.assert_array_equal(after.start.layers[0][0], second)
+    np.testing.assert_array_equal(after.start.layers[0][0], first)
 
 
 def test_a_contest_leaves_out_half_again_and_again(monkeypatch):
@@ -274,7 +274,7 @@ def test_a_contest_leaves_out_half_again_and_again(monkeypatch):
 
     origin = bias(shipped_network())
     config = GradientConfig(steps=8, chunk=1)
-    run = TrainRun(gradient=config, sac=SACConfig(attempts=4))
+    run = TrainRun(gradient=config, sac=SACConfig(contestants=4))
     contest = Gradient.of(run, policies[0], TASK)
     assert type(contest) is Contest
     moves = []
@@ -304,8 +304,3 @@ def test_the_last_halving_is_in_the_middle(contestants, kept):
     times = {2: (0, 39, 40, 79), 3: (0, 20, 39, 40), 5: (9, 10, 20, 40)}[contestants]
     assert [contest.kept(done) for done in times] == list(map(int, kept))
     assert contest.kept(79) == 1
-
-
-def test_demonstrations_are_for_one_attempt():
-    with refused("attempts is 2; with demonstrations it must be 1"):
-        SACConfig(attempts=2, demonstrations=DemonstrationConfig(episodes=1))

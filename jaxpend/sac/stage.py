@@ -1,4 +1,4 @@
-"""The stages of ``jaxpend sac``: imitation of demonstrations, SAC itself, and several attempts."""
+"""The stages of ``jaxpend sac``: imitation of demonstrations, and SAC itself."""
 
 from functools import partial
 from typing import Any, Self
@@ -15,7 +15,9 @@ from ..stage import Candidates, Chart, Row, Stage, value
 from . import algorithm
 from .algorithm import Agent, SACState
 
-__all__ = ["SAC", "Attempts", "AttemptsState", "Imitation", "ImitationState", "chunk_length"]
+__all__ = [
+    "SAC", "Contestants", "ContestantsState", "Imitation", "ImitationState", "chunk_length",
+]  # fmt: skip
 
 
 @pytree
@@ -108,8 +110,8 @@ class SAC(Stage[SACState | None, SACState, Controller]):
     @classmethod
     def of(cls, run: Run, start: Controller | None, task: Task) -> Stage | None:
         config = getattr(run, "sac", None)
-        if config and config.attempts > 1:
-            return Attempts(config, task)
+        if config and config.contestants > 1:
+            return Contestants(config, task)
         return cls(config, task) if config else None
 
     def start(self, seed: int, before: SACState | None) -> SACState:
@@ -153,74 +155,64 @@ class SAC(Stage[SACState | None, SACState, Controller]):
 
 
 @pytree
-class AttemptsState(Pytree):
-    """An attempt under way, and the best policy of each."""
+class ContestantsState(Pytree):
+    """SAC, and the best policies of all that were judged."""
 
     sac: SACState
-    number: jax.Array  # () int, of the attempt, from 0
     policies: tuple[Controller, ...]
-    worths: jax.Array  # (attempts,) what they are compared by; -inf before an attempt
+    worths: jax.Array  # (contestants,) what they are compared by; -inf: not yet judged
 
 
-class Attempts(Stage[SACState | None, AttemptsState, tuple[Controller, ...]]):
-    """SAC several times from scratch, each with a key of its own; all go on to the next stage."""
+class Contestants(Stage[SACState | None, ContestantsState, tuple[Controller, ...]]):
+    """SAC, of which not only the best policy goes on to the next stage."""
 
     name, title, unit, column = SAC.name, SAC.title, SAC.unit, SAC.column
     heading, scores, charts, ties = SAC.heading, SAC.scores, SAC.charts, SAC.ties
 
     def __init__(self, config: SACConfig, task: Task):
-        self.inner, self.each = SAC(config, task), config.steps
-        self.agent, self.total = self.inner.agent, config.attempts * self.each
+        self.inner, self.agent, self.total = SAC(config, task), Agent(config, task), config.steps
 
-    def start(self, seed: int, before: SACState | None) -> AttemptsState:
-        sac, count = self.inner.start(seed, before), self.agent.config.attempts
+    def start(self, seed: int, before: SACState | None) -> ContestantsState:
+        sac, count = self.inner.start(seed, before), self.agent.config.contestants
         policies: tuple[Controller, ...] = (algorithm.greedy_policy(self.agent, sac),) * count
-        return AttemptsState(sac, jnp.asarray(0), policies, jnp.full(count, -jnp.inf))
+        return ContestantsState(sac, policies, jnp.full(count, -jnp.inf))
 
-    def like(self) -> AttemptsState:
+    def like(self) -> ContestantsState:
         return jax.eval_shape(partial(self.start, 0, None))
 
     def policy_like(self) -> Controller | None:
         return self.inner.policy_like()
 
-    def done(self, state: AttemptsState) -> int:
-        return int(state.number) * self.each + min(self.inner.done(state.sac), self.each)
+    def done(self, state: ContestantsState) -> int:
+        return self.inner.done(state.sac)
 
-    def _next(self, state: AttemptsState) -> AttemptsState:
-        """The same, or the next attempt where one is finished."""
-        if self.inner.done(state.sac) < self.each:
-            return state
-        sac = algorithm.begin(self.agent, jax.random.fold_in(state.sac.key, state.number))[0]
-        return state.replace(sac=sac, number=state.number + 1)
-
-    def advance(self, states: list[AttemptsState]) -> list[tuple[AttemptsState, Row]]:
-        states, after = [self._next(state) for state in states], []
+    def advance(self, states: list[ContestantsState]) -> list[tuple[ContestantsState, Row]]:
+        after = []
         moved = self.inner.advance([state.sac for state in states])
         for state, (sac, metrics) in zip(states, moved, strict=True):
             row, [(policy, worth)] = self.inner.judge(sac, metrics)
-            policies, number = list(state.policies), int(state.number)
-            if worth >= state.worths[number]:
-                policies[number] = policy
-                state = state.replace(worths=state.worths.at[number].set(worth))
-            row["attempt"] = number + 1
+            policies, last = list(state.policies), int(jnp.argmin(state.worths))
+            if worth >= state.worths[last]:
+                policies[last] = policy
+                state = state.replace(worths=state.worths.at[last].set(worth))
             after.append((state.replace(sac=sac, policies=tuple(policies)), row))
         return after
 
-    def judge(self, state: AttemptsState, metrics: Row) -> tuple[Row, Candidates]:
+    def judge(self, state: ContestantsState, metrics: Row) -> tuple[Row, Candidates]:
         if not metrics:
             return self.inner.judge(state.sac, metrics)
         return metrics, [(algorithm.greedy_policy(self.agent, state.sac), metrics["value"])]
 
     def note(self, row: Row) -> str:
-        return f"attempt {row['attempt']}  {self.inner.note(row)}"
+        return self.inner.note(row)
 
-    def watched(self, state: AttemptsState) -> Any:
+    def watched(self, state: ContestantsState) -> Any:
         return self.inner.watched(state.sac)
 
-    def rekey(self, state: AttemptsState, number: int) -> AttemptsState:
+    def rekey(self, state: ContestantsState, number: int) -> ContestantsState:
         return state.replace(sac=self.inner.rekey(state.sac, number))
 
-    def outcome(self, state: AttemptsState, best: Controller) -> tuple[Controller, ...]:
-        """The best policy of each attempt, the best of all first."""
+    def outcome(self, state: ContestantsState, best: Controller) -> tuple[Controller, ...]:
+        """The best policies, the best of all first."""
         order = sorted(range(len(state.policies)), key=lambda i: -float(state.worths[i]))
         return tuple(state.policies[i] for i in order)
