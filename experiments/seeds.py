@@ -20,6 +20,7 @@ import numpy as np
 
 from jaxpend import load_policy, save_policy
 from jaxpend.controllers.policy import network_in
+from jaxpend.files import write_atomically
 from jaxpend.score import official
 
 HERE = Path(__file__).parent
@@ -102,8 +103,16 @@ def train(recipe: str, robot: str, seed: int, runs: Path, flags: Sequence[str] =
         "imitation": None if recipe in ("plain", "learned") else first["score"],
         **{n: {k: result[n][k] for k in keys} for n in STAGES if n in result},
         "criteria": result["snes"]["criteria"],
-        "robustness": robustness(robot, folder / "policy.npz"),
+        "robustness": judged(robot, folder),
     }
+
+
+def judged(robot: str, folder: Path) -> dict:
+    """``robustness`` of the policy of a run, which stays in the folder of the run."""
+    kept = folder / "robustness.json"
+    if not kept.exists():
+        write_atomically(kept, json.dumps(robustness(robot, folder / "policy.npz")) + "\n")
+    return json.loads(kept.read_text())
 
 
 def without(recipe: str, robot: str, seed: int, runs: Path) -> dict:
@@ -111,10 +120,10 @@ def without(recipe: str, robot: str, seed: int, runs: Path) -> dict:
     folder = folder_of("shipped", robot, seed, runs)
     path = folder / f"{recipe}.npz".replace(" ", "-")
     save_policy(path, load_policy(folder / "policy.npz").replace(**TAKEN[recipe]))
-    judged = official(load_policy(path), robot)
+    found = official(load_policy(path), robot)
     row = {"recipe": recipe, "robot": robot, "seed": seed, "imitation": None}
-    row["snes"] = {"score": judged["score"], "success": judged["success"], "seconds": 0}
-    return row | {"criteria": judged["criteria"], "robustness": robustness(robot, path)}
+    row["snes"] = {"score": found["score"], "success": found["success"], "seconds": 0}
+    return row | {"criteria": found["criteria"], "robustness": robustness(robot, path)}
 
 
 def table(rows: list[dict], jobs: int) -> str:
