@@ -238,13 +238,20 @@ def test_chunks_are_of_one_length_where_they_can_be():
 
 def test_the_best_of_the_judged_policies_go_on(monkeypatch):
     config = SACConfig(
-        steps=16, num_envs=4, contestants=2, eval_every=4, replay_capacity=64, warmup_steps=4,
-        batch_size=4, updates_per_step=1, actor_hidden=(4,), critic_hidden=(4,),
+        steps=16, num_envs=4, contestants=2, eval_every=4, replay_capacity=64,
+        actor_hidden=(4,), critic_hidden=(4,),
     )  # fmt: skip
     worths = iter([0.1, 0.5, 0.2, 0.3, 0.3])  # at the start, then after each step
     monkeypatch.setattr("jaxpend.sac.stage.value", lambda *rest: next(worths))
     search = SAC.of(SACRun(sac=config), None, TASK)
     assert (type(search), search.total) == (Contestants, 16)
+
+    def moved(states):
+        [sac] = states
+        actor = jax.tree.map(lambda leaf: leaf + 1, sac.actor)
+        return [(sac.replace(actor=actor, env_steps=sac.env_steps + 4), {})]
+
+    monkeypatch.setattr(search.inner, "advance", moved)
     state = search.start(0, None)
     search.judge(state, {})
     seen, policies = [], []
