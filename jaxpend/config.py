@@ -176,7 +176,7 @@ class SACConfig(Checked):
     actor_delay: Natural = 0  # environment steps before the actor learns; the critics start at once
     eval_every: Count = 25_000  # environment steps between judgements by the official score
     objective: Objective = dataclasses.field(default_factory=Objective)  # of which policy is best
-    # Of the policies that are judged the best so many go on; the gradient lets them compete.
+    # The best policy of each of so many equal parts goes on; the gradient lets them compete.
     contestants: Annotated[int, Bounds(least=1, most=100)] = 1
 
     def __post_init__(self) -> None:

@@ -156,15 +156,18 @@ class SAC(Stage[SACState | None, SACState, Controller]):
 
 @pytree
 class ContestantsState(Pytree):
-    """SAC, and the best policies of all that were judged."""
+    """SAC, and the best policies of equal parts of it."""
 
     sac: SACState
     policies: tuple[Controller, ...]
-    worths: jax.Array  # (contestants,) what they are compared by; -inf: not yet judged
+    worths: jax.Array  # (contestants,) what they are compared by; -inf before a part
 
 
 class Contestants(Stage[SACState | None, ContestantsState, tuple[Controller, ...]]):
-    """SAC, of which not only the best policy goes on to the next stage."""
+    """SAC, of which the best policy of each of several equal parts goes on to the next stage.
+
+    Late policies are much alike; those of different parts swing up in different ways.
+    """
 
     name, title, unit, column = SAC.name, SAC.title, SAC.unit, SAC.column
     heading, scores, charts, ties = SAC.heading, SAC.scores, SAC.charts, SAC.ties
@@ -186,15 +189,19 @@ class Contestants(Stage[SACState | None, ContestantsState, tuple[Controller, ...
     def done(self, state: ContestantsState) -> int:
         return self.inner.done(state.sac)
 
+    def _part(self, state: ContestantsState) -> int:
+        count = self.agent.config.contestants
+        return min(self.done(state) * count // self.total, count - 1)
+
     def advance(self, states: list[ContestantsState]) -> list[tuple[ContestantsState, Row]]:
         after = []
         moved = self.inner.advance([state.sac for state in states])
         for state, (sac, metrics) in zip(states, moved, strict=True):
             row, [(policy, worth)] = self.inner.judge(sac, metrics)
-            policies, last = list(state.policies), int(jnp.argmin(state.worths))
-            if worth >= state.worths[last]:
-                policies[last] = policy
-                state = state.replace(worths=state.worths.at[last].set(worth))
+            policies, part = list(state.policies), self._part(state)
+            if worth >= state.worths[part]:
+                policies[part] = policy
+                state = state.replace(worths=state.worths.at[part].set(worth))
             after.append((state.replace(sac=sac, policies=tuple(policies)), row))
         return after
 
