@@ -91,13 +91,15 @@ def policy_of(params, env: Env) -> Policy:
 def train(robot: str, seed: int, steps: int, chunk: int, path: Path) -> Iterator[dict]:
     """One run: its row of the file after every chunk. The best policy of all is kept."""
     recipe = load_config(TrainRun(robot=robot), "plain").sac
-    env, updates = Env(recipe.env, v2(robot).task), recipe.updates_per_step
+    env = Env(recipe.env, v2(robot).task)
     algorithm = SAC.create(
         env=Task(env, recipe.reward_scale),
         agent_kwargs={"activation": recipe.activation, "hidden_layer_sizes": recipe.actor_hidden},
-        num_envs=recipe.num_envs, num_epochs=updates, buffer_size=400_000,
+        num_envs=recipe.num_envs, num_epochs=recipe.updates_per_step, buffer_size=400_000,
         fill_buffer=recipe.warmup_steps, batch_size=recipe.batch_size, gamma=recipe.discount,
-        learning_rate=recipe.learning_rate, polyak=(1 - recipe.target_rate) ** updates,
+        learning_rate=recipe.learning_rate,
+        # Its targets move once a step of all environments, ours once an update.
+        polyak=(1 - recipe.target_rate) ** recipe.updates_per_step,
         total_timesteps=chunk, eval_freq=chunk, skip_initial_evaluation=True,
     ).replace(eval_callback=lambda *_: ())  # fmt: skip
     advance = jax.jit(lambda state: algorithm.train(train_state=state)[0])

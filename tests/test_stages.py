@@ -14,6 +14,7 @@ from training_runs import events_of, rows_of
 from jaxpend import Policy, save_policy, stage
 from jaxpend.boards import v2
 from jaxpend.config import (
+    DemonstrationConfig,
     GradientConfig,
     Objective,
     SACConfig,
@@ -270,6 +271,14 @@ def test_the_best_policy_of_each_part_goes_on(monkeypatch):
     # What goes on from one controller takes the best.
     after = SNES(SNESConfig(population=2), shipped_network(), TASK).start(0, best)
     np.testing.assert_array_equal(after.start.layers[0][0], tied)
+
+
+def test_contestants_may_have_demonstrations():
+    shown = DemonstrationConfig(episodes=1, duration=0.1)
+    config = SACConfig(contestants=2, demonstrations=shown, steps=100, replay_capacity=64)
+    state = Contestants(config, TASK).like()
+    assert state.sac.demonstrations is not None
+    assert len(state.policies) == len(state.worths) == 2
 
 
 def test_a_contest_leaves_out_half_again_and_again(monkeypatch):

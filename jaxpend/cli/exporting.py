@@ -38,7 +38,8 @@ def export(
             here, in float64 within 1e-9.
     """
     if to in ("numpy", "realaigym") and precision == "float32":
-        raise JaxpendError(f"--precision is float32; {to} computes in float64, as onnx and c can")
+        text = f"--precision is float32; {to} computes in float64 alone: leave it out"
+        raise JaxpendError(f"{text}, or export to onnx or c")
     if to == "realaigym":
         return _submit(policy, out)
     _check_out(out)

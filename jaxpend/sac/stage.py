@@ -175,13 +175,16 @@ class Contestants(Stage[SACState | None, ContestantsState, tuple[Controller, ...
     def __init__(self, config: SACConfig, task: Task):
         self.inner, self.agent, self.total = SAC(config, task), Agent(config, task), config.steps
 
-    def start(self, seed: int, before: SACState | None) -> ContestantsState:
-        sac, count = self.inner.start(seed, before), self.agent.config.contestants
+    def _unjudged(self, sac: SACState) -> ContestantsState:
+        count = self.agent.config.contestants
         policies: tuple[Controller, ...] = (algorithm.greedy_policy(self.agent, sac),) * count
         return ContestantsState(sac, policies, jnp.full(count, -jnp.inf))
 
+    def start(self, seed: int, before: SACState | None) -> ContestantsState:
+        return self._unjudged(self.inner.start(seed, before))
+
     def like(self) -> ContestantsState:
-        return jax.eval_shape(partial(self.start, 0, None))
+        return jax.eval_shape(self._unjudged, self.inner.like())
 
     def policy_like(self) -> Controller | None:
         return self.inner.policy_like()
