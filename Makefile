@@ -1,8 +1,9 @@
-# `make` alone lists what there is. Variables: ROBOT, RECIPE, SEED, RUN (name of the run), ARGS.
+# `make` alone lists what there is. Variables: ROBOT, TASK, RECIPE, SEED, RUN (name of the run), ARGS.
 ROBOT ?= pendubot
+TASK ?= v2
 RECIPE ?= demonstrated
 SEED ?= 0
-RUN ?= $(ROBOT)$(if $(filter demonstrated,$(RECIPE)),,-$(RECIPE))-seed$(SEED)
+RUN ?= $(ROBOT)$(if $(filter v2,$(TASK)),$(if $(filter demonstrated,$(RECIPE)),,-$(RECIPE)),-$(TASK))-seed$(SEED)
 ARGS ?=
 PYTHON ?= python3
 VENV := .venv
@@ -12,9 +13,13 @@ STAMP := $(VENV)/.installed
 ifeq ($(filter $(ROBOT),acrobot pendubot),)
 $(error ROBOT is '$(ROBOT)'; it must be acrobot or pendubot)
 endif
+ifeq ($(filter $(TASK),v2 global),)
+$(error TASK is '$(TASK)'; it must be v2 or global)
+endif
 
 # What `make train` reads: a recipe that ships with the package.
-CONFIG = $(or $(CONFIG_$(RECIPE)),$(error RECIPE is '$(RECIPE)'; it must be demonstrated, learned or plain))
+CONFIG = $(if $(filter global,$(TASK)),global_$(ROBOT),$(CONFIG_OF_RECIPE))
+CONFIG_OF_RECIPE = $(or $(CONFIG_$(RECIPE)),$(error RECIPE is '$(RECIPE)'; it must be demonstrated, learned or plain))
 CONFIG_demonstrated := $(ROBOT)
 CONFIG_learned := learned_$(ROBOT)
 CONFIG_plain := plain
@@ -25,7 +30,7 @@ CONFIG_plain := plain
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 	@echo
-	@echo "variables: ROBOT=acrobot|pendubot  RECIPE=demonstrated|learned|plain  SEED=0  RUN=name  ARGS='--sac.steps 100000'"
+	@echo "variables: ROBOT=acrobot|pendubot  TASK=v2|global  RECIPE=demonstrated|learned|plain  SEED=0  RUN=name  ARGS='--sac.steps 100000'"
 	@echo "the command behind them, with its own --help: $(BIN)/jaxpend"
 
 $(STAMP): pyproject.toml .constraints.txt
@@ -37,7 +42,7 @@ $(STAMP): pyproject.toml .constraints.txt
 
 install: $(STAMP)  ## make .venv with pinned versions
 
-train: $(STAMP)  ## train by a recipe, RECIPE=demonstrated|learned|plain; ends with the official score
+train: $(STAMP)  ## train for TASK=v2|global, v2 by RECIPE=...; ends with the official score
 	$(BIN)/jaxpend train --config $(CONFIG) --robot $(ROBOT) --seed $(SEED) --run $(RUN) $(ARGS)
 
 snes: $(STAMP)  ## fine-tune by SNES: ARGS='--policy FILE' or '--controller NAME'

@@ -69,12 +69,12 @@ def again(controller, times, states):
     return jax.jit(run)((times, states))
 
 
-def in_c(controller, times, states):
+def in_c(controller, times, states, precision="float32"):
     """Torques (N, 2), and ns a step."""
     pointer = ctypes.POINTER(ctypes.c_float)
     arrays = [np.ascontiguousarray(a, "f4") for a in (times, states, np.zeros((len(times), 2)))]
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "controller.h").write_text(c.source(controller))
+        (Path(folder) / "controller.h").write_text(c.source(controller, precision=precision))
         (Path(folder) / "main.c").write_text(MAIN)
         flags = "-std=c99 -Wall -Werror -O2 -shared -fPIC main.c -o main.so -lm"
         subprocess.run(["gcc", *flags.split()], cwd=folder, check=True)
@@ -115,8 +115,8 @@ def session_of(controller, precision):
 
 def main() -> None:
     """Print a table in Markdown."""
-    print("| | numpy, float64 | ONNX, float64 | C, float32 | jax again, float32 |")
-    print("|---|---|---|---|---|")
+    print("| | numpy, float64 | ONNX, float64 | C, mixed | C, float32 | jax again, float32 |")
+    print("|---|---|---|---|---|---|")
     for name, make in CONTROLLERS.items():
         robot = "acrobot" if "acrobot" in name else "pendubot"
         with jax.enable_x64(True):
@@ -127,15 +127,19 @@ def main() -> None:
             exec(numpy.source(wide), names)
             plain, plain_us = one_by_one(names["Controller"]().torque, t, x)
             model, model_us = one_by_one(session_of(wide, "float64"), t, x)
+            rounded = t.astype("f4").astype(float), x.astype("f4").astype(float)
+            exact, _ = one_by_one(names["Controller"]().torque, *rounded)
+            mixed, mixed_ns = in_c(wide, t, x, "mixed")
         narrow = jax.jit(rollout)(v2(robot).task.plant, make(), jax.random.key(0))
         t, x = np.asarray(narrow.t[:-1]), np.asarray(narrow.x_measured)
         short, short_ns = in_c(make(), t, x)
         ours = again(make(), t, x)
-        far = [np.abs(a - b).max() for a, b in ((plain, u), (model, u))]
+        far = [np.abs(a - b).max() for a, b in ((plain, u), (model, u), (mixed, exact))]
         far += [np.abs(np.asarray(a) - narrow.u_command).max() for a in (short, ours)]
         print(
             f"| {name} | {far[0]:.1e} N m, {plain_us:.0f} us | {far[1]:.1e} N m, {model_us:.0f} us "
-            f"| {far[2]:.1e} N m, {short_ns:.0f} ns | {far[3]:.1e} N m |",
+            f"| {far[2]:.1e} N m, {mixed_ns:.0f} ns | {far[3]:.1e} N m, {short_ns:.0f} ns "
+            f"| {far[4]:.1e} N m |",
             flush=True,
         )
 

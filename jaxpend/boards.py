@@ -14,18 +14,22 @@ import numpy as np
 
 from . import designs
 from .controller import robot_of
-from .criteria import HEIGHT, V2_HARDWARE, Criteria, ScoreV2, criteria
+from .criteria import HEIGHT, V2_HARDWARE, V2_OFFICIAL, Criteria, ScoreV2, ScoreV3, criteria
 from .errors import JaxpendError, choose
 from .plant import Plant
+from .resets import HOLD, JITTER, Resets, official_resets, random_resets
 from .robots import ROBOTS, active_joint
 from .rollout import Trajectory
 from .scenario import DT, Scenario
 from .variations import RANGES, sample
 
 __all__ = [
-    "CRITERIA", "HEADINGS", "V2", "Board", "Strip", "Task", "board", "hardware", "own_task",
-    "strips", "task_of", "v2",
+    "BOARDS", "CRITERIA", "HEADINGS", "V2", "V3", "Board", "Strip", "Task", "board", "hardware",
+    "named_board", "own_task", "strips", "task_of", "v2", "v3",
 ]  # fmt: skip
+
+
+TRIALS = 16  # of a task in which chance plays: what a judgement in training is the mean of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,12 +46,17 @@ class Task:
     duration: float = 10.0  # s
     height: float = HEIGHT  # the line, as a fraction of the stretched height
     scoring: Callable[[Criteria], jax.Array] = ScoreV2()  # hashable
+    resets: int = 0  # times in a run that somebody throws the arm, see ``jaxpend.resets``
 
     def __post_init__(self) -> None:
         active_joint(self.robot)
         for name in ("torque_limit", "dt", "duration", "height"):
             if not 0 < getattr(self, name) < np.inf:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be positive")
+        most = int(self.duration / (2 * JITTER + HOLD + self.dt)) - 1
+        if self.resets != int(self.resets) or not 0 <= self.resets <= max(most, 0):
+            text = f"it must be a whole number, in {self.duration:g} s {max(most, 0)} at most"
+            raise JaxpendError(f"resets is {self.resets}; {text}")
 
     @property
     def plant(self) -> Plant:
@@ -69,9 +78,36 @@ class Task:
         """Steps of ``dt`` in a run."""
         return round(self.duration / self.dt)
 
+    @property
+    def shipped(self) -> str:
+        """Name of the policy that ships for it."""
+        return f"global_{self.robot}" if self.resets else self.robot
+
+    @property
+    def trials(self) -> int:
+        """Runs of which training takes the mean score: one, or several where chance plays."""
+        return TRIALS if self.resets else 1
+
+    def trial(self, key: jax.Array) -> Scenario:
+        """A scenario that the score is of: the nominal plant, with resets that ``key`` draws."""
+        return self._thrown(Scenario(self.plant), key)
+
     def sample(self, key: jax.Array, share: float = 1.0) -> Scenario:
-        """A random imperfect scenario around the plant, see ``variations.sample``."""
-        return sample(self.plant, key, share)
+        """The same with a random imperfection, see ``variations.sample``; ``key`` is consumed."""
+        return self._thrown(sample(self.plant, key, share), key)
+
+    def _thrown(self, scenario: Scenario, key: jax.Array) -> Scenario:
+        if not self.resets:
+            return scenario
+        key = jax.random.fold_in(key, 1)  # apart from what else is drawn
+        resets = random_resets(key, self.resets, dt=self.dt, duration=self.duration)
+        return self.with_resets(scenario, resets)
+
+    def with_resets(self, scenario: Scenario, resets: Resets | None) -> Scenario:
+        """The scenario with resets, in which both joints are driven, up to the torque limit."""
+        ones = np.ones(2, scenario.dtype)
+        plant = scenario.plant.replace(torque_limit=self.torque_limit * ones, actuation=ones)
+        return scenario.replace(plant=plant, resets=resets)
 
     def criteria(self, run: Trajectory, plant: Plant | None = None) -> Criteria:
         """The criteria of a trajectory; ``plant`` gives the link lengths, by default the task's."""
@@ -138,22 +174,36 @@ class Board:
 
     name: str
     task: Task
-    trials: Callable[[Plant], list[Strip]] = strips  # of robustness, around the nominal plant
-    published: tuple[tuple[str, float, float], ...] = ()  # title, performance, robustness
+    # Of robustness, around the nominal plant; None: the board does not ask for it.
+    trials: Callable[[Plant], list[Strip]] | None = strips
+    # Title, performance, robustness.
+    published: tuple[tuple[str, float, float | None], ...] = ()
+    seeds: int = 1  # official draws, from 0 on, that a score is the mean of
+    columns: tuple[str, ...] = tuple(V2_OFFICIAL)  # criteria that its tables show
 
     @property
     def robot(self) -> str:
         """ "acrobot" or "pendubot"."""
         return self.task.robot
 
+    def drawn(self, seed: int) -> Scenario | None:
+        """The official trial of a seed, in jax's default float type; None: the nominal plant."""
+        task, scenario = self.task, Scenario(self.task.plant)
+        if not task.resets:
+            return None
+        resets = official_resets(seed, task.resets, dt=task.dt, duration=task.duration)
+        return task.with_resets(scenario, resets)
 
-# The criteria of the performance score: heading, unit, format, and a short heading for a terminal.
+
+# The criteria that tables show: heading, unit, format, and a short heading for a terminal.
 HEADINGS = {
     "swingup_time": ("swing-up", "s", ".2f", "swing-up"),
     "energy": ("energy", "J", ".2f", "energy"),
     "tau_cost": ("torque cost", "N²m²s", ".2f", "torque"),
     "tau_smoothness": ("smoothness", "N m", ".4f", "smooth"),
     "velocity_cost": ("velocity cost", "rad²/s", ".1f", "velocity"),
+    "uptime": ("time up", "s", ".2f", "time up"),
+    "number_of_swingups": ("swing-ups", "1", ".1f", "swing-ups"),
 }
 # Performance and robustness, as published (arXiv 2409.08938 and the boards).
 _PUBLISHED = {
@@ -179,18 +229,60 @@ V2 = {
     for robot in ROBOTS
 }
 
+# The third AI Olympics, 2025; the figure of one draw each.
+_PUBLISHED_V3 = {
+    "acrobot": (
+        ("AR-EAPO", 0.658, None),
+        ("VIMPPI", 0.648, None),
+        ("acados MPC", 0.630, None),
+        ("MC-PILCO", 0.307, None),
+    ),
+    "pendubot": (
+        ("VIMPPI", 0.799, None),
+        ("AR-EAPO", 0.759, None),
+        ("acados MPC", 0.726, None),
+        ("MC-PILCO", 0.509, None),
+    ),
+}
+V3 = {
+    robot: Board(
+        "v3",
+        Task(robot, designs.COMPETITION, duration=60.0, scoring=ScoreV3(60.0), resets=15),
+        trials=None,
+        published=_PUBLISHED_V3[robot],
+        seeds=1000,
+        columns=("uptime", "number_of_swingups", "energy", "tau_cost", "velocity_cost"),
+    )
+    for robot in ROBOTS
+}
+BOARDS = {"v2": V2, "v3": V3}
+
 
 def v2(robot: str) -> Board:
     """The v2 board of a robot. Raises ``JaxpendError`` for an unknown one."""
-    return V2[choose("robot", robot, V2)]
+    return named_board(robot, "v2")
+
+
+def v3(robot: str) -> Board:
+    """The v3 board, of global policies. Raises ``JaxpendError`` for an unknown robot."""
+    return named_board(robot, "v3")
+
+
+def named_board(robot: str, name: str) -> Board:
+    """The board of a robot by name. Raises ``JaxpendError`` for an unknown robot or name."""
+    board = BOARDS[choose("board", name, BOARDS)]
+    return board[choose("robot", robot, board)]
 
 
 def hardware(judged_on: "Board | str") -> Board:
     """A board with the normalisation that runs of the real robots are scored with.
 
     More torque cost and less smoothness count as good there. The published rows are left out.
+    Raises ``JaxpendError`` for a board that is not scored as v2 is.
     """
     simulated = board(judged_on)
+    if not isinstance(simulated.task.scoring, ScoreV2):
+        raise JaxpendError(f"the {simulated.name} board has no normalisation for real robots")
     task = dataclasses.replace(simulated.task, scoring=ScoreV2(tuple(V2_HARDWARE.items())))
     name = f"{simulated.name}, hardware"
     return dataclasses.replace(simulated, name=name, task=task, published=())
@@ -215,18 +307,20 @@ def board(robot_or_board: "str | Board") -> Board:
     return robot_or_board if isinstance(robot_or_board, Board) else v2(robot_or_board)
 
 
-def task_of(robot: str, plant: str | None = "", design: str | None = "") -> Task:
-    """The v2 task of a robot, on another plant where one is named; the torque limit stays 6 N m.
+def task_of(robot: str, plant: str | None = "", design: str | None = "", board: str = "v2") -> Task:
+    """The task of a robot, on another plant where one is named; the torque limit stays 6 N m.
 
     Args:
         robot: "acrobot" or "pendubot".
         plant: file of parameters (``designs.read``); empty or None: none.
         design: name of an identified set (``designs.parameters``); empty or None: none.
+        board: name of the board whose task it is.
 
     Raises:
-        JaxpendError: an unknown robot or design, both given, or a file that cannot be used.
+        JaxpendError: an unknown robot, board or design, plant and design given, or a file that
+            cannot be used.
     """
-    task = v2(robot).task
+    task = named_board(robot, board).task
     if plant and design:
         raise JaxpendError(f"plant {plant} and design {design} are both given; there is one plant")
     if plant:

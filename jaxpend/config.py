@@ -12,6 +12,7 @@ from typing import Annotated, Literal, get_args
 from .errors import JaxpendError
 from .fields import (
     LARGEST,
+    BoardName,
     Bounds,
     Checked,
     Count,
@@ -75,6 +76,8 @@ class Reward(Checked):
     phi1: NotNegative = 0.15  # change of the action, above the line
     phi2: NotNegative = 0.15  # change of the action, below
     eta: NotNegative = 0.02  # s^2, joint velocities squared, below
+    # Whole turns that the joints are off, above the line: a hand that resets the arm undoes them.
+    turns: NotNegative = 0.0
     # A step earns at least this; a spinning arm earns -100 and less.
     floor: Annotated[float, Bounds(most=0, infinite=True)] = -math.inf
 
@@ -107,15 +110,19 @@ class EnvConfig(Checked):
     # Share of episodes that start anywhere: uniform angles, velocities with a standard deviation
     # of 5 rad/s.
     random_starts: Share = 0.0
+    thrown_starts: Share = 0.0  # share of episodes that start as a reset by hand leaves the arm
     randomised: Share = 0.0  # share of episodes in a random scenario, see ``variations``
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.dt > self.duration:
             raise JaxpendError(f"dt is {self.dt}; it must not be longer than an episode")
-        if self.upright_starts + self.random_starts > 1:
-            text = f"{self.upright_starts} and {self.random_starts}; they are shares of one whole"
-            raise JaxpendError(f"upright_starts and random_starts are {text}")
+        starts = {n: v for n, v in vars(self).items() if n.endswith("_starts") and v}
+        if sum(starts.values()) > 1:
+            names, values = (
+                " and ".join(map(str, words)) for words in zip(*starts.items(), strict=True)
+            )
+            raise JaxpendError(f"{names} are {values}; they are shares of one whole")
 
     @property
     def episode_steps(self) -> int:
@@ -259,6 +266,9 @@ class GradientConfig(Checked):
     gain_learning_rate: Positive = 1e-3  # of the logarithm of all else: a fraction
     final_learning_rate: Positive = 0.01  # cosine decay to this fraction of learning_rate
     duration: Duration = 3.0  # s of the nominal run; afterwards a good policy stands still
+    starts: Count = (
+        1  # runs a step, from where resets by hand leave the arm; 1 where there are none
+    )
     clip: Positive = 0.1  # norm of the gradient of one run
     searched: str = "all"  # as in SNESConfig
     line_width: Positive = 0.005  # m, over which the line is blurred
@@ -282,6 +292,7 @@ class Run(Checked):
     """What every training run has."""
 
     robot: Robot = "pendubot"
+    board: BoardName = "v2"  # whose task it is; v3: the one of global policies
     plant: str = ""  # file of the parameters of another plant; empty: that of the boards
     design: str = ""  # or an identified one by name, such as C.1/1.0
     seed: Seed = 0

@@ -8,16 +8,19 @@ and action. See ``sac.networks.Actor`` for why the policy does not see it.
 """
 
 import dataclasses
+import functools
 from typing import TypeVar
 
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .boards import Task
 from .config import LINES, EnvConfig, Reward
 from .plant import Plant, forward_kinematics, kinetic_energy, potential_energy, rk4_step
 from .pytree import Pytree, pytree
+from .resets import thrown
 from .rollout import actuate, draws, measure
 from .scenario import DT, Scenario
 from .variations import LONGEST_DELAY, sample
@@ -35,6 +38,7 @@ __all__ = [
 
 T = TypeVar("T")
 
+THROWN = 8192  # states of which an episode that starts after a reset draws one
 START_SPEED = 5.0  # rad/s, standard deviation of velocities of an episode that starts anywhere
 
 
@@ -44,7 +48,8 @@ def surrogate_reward(plant: Plant, reward: Reward, line: float, x, action, befor
     With end-effector height y, potential and kinetic energy V and T, and action change da:
     ``V + alpha (1 + cos theta2)^2 - beta T - rho1 a^2 - phi1 |da|`` where y is above the line,
     ``V - rho2 a^2 - phi2 |da| - eta (omega1^2 + omega2^2)`` below it, at least ``floor``. The
-    ``line`` is a height in m; that of the coefficients may be None.
+    ``line`` is a height in m; that of the coefficients may be None. Ours is a charge of ``turns``
+    above the line for every whole turn that the joints are off, see ``whole_turns``.
     """
     height = forward_kinematics(plant, x)[1, 1]
     potential, kinetic = potential_energy(plant, x), kinetic_energy(plant, x)
@@ -52,9 +57,17 @@ def surrogate_reward(plant: Plant, reward: Reward, line: float, x, action, befor
     straight = (1 + jnp.cos(x[1])) ** 2
     above = reward.alpha * straight - reward.beta * kinetic
     above = above - reward.rho1 * effort - reward.phi1 * change
+    if reward.turns:
+        above = above - reward.turns * jnp.sum(jnp.abs(whole_turns(x)))
     below = -reward.rho2 * effort - reward.phi2 * change - reward.eta * (x[2] ** 2 + x[3] ** 2)
     total = potential + jnp.where(height > line, above, below)
     return jnp.maximum(total, reward.floor)
+
+
+def whole_turns(x: jax.Array) -> jax.Array:
+    """Whole turns (2,) by which an arm (4,) that stands is off; upright at -pi is none, too."""
+    shoulder = jnp.sign(x[0]) * jnp.maximum(jnp.abs(x[0]) - jnp.pi, 0.0)
+    return jnp.round(jnp.stack([shoulder, x[1]]) / (2 * jnp.pi))
 
 
 @pytree
@@ -82,6 +95,20 @@ class EnvState(Pytree):
     reward: jax.Array  # () of arriving here
 
 
+def _among(share: float, others: float) -> float:
+    """A share of all episodes as one of those that are not among the ``others``."""
+    return min(share / (1 - others), 1.0) if others < 1 else 0.0
+
+
+@functools.cache
+def _thrown_states(task: Task) -> np.ndarray:
+    """States (THROWN, 4) in which resets by hand leave the arm: a table, since one takes long."""
+    with jax.ensure_compile_time_eval():
+        plant = task.with_resets(Scenario(task.plant), None).plant
+        keys = jax.random.split(jax.random.key(0), THROWN)
+        return np.asarray(jax.jit(jax.vmap(lambda key: thrown(plant, key, task.dt)))(keys))
+
+
 @dataclasses.dataclass(frozen=True)
 class Env:
     """Acrobot or pendubot as a task for a learner; hashable, so static in jit.
@@ -107,6 +134,8 @@ class Env:
     def observe(self, x, action, past, world, reward) -> EnvState:
         """A state with what is seen in it; the arguments are as in ``EnvState``."""
         view, privileged = self.config.observation, action[None]
+        if self.config.reward.turns:
+            privileged = jnp.append(whole_turns(x), privileged)
         if world is not None:
             privileged = jnp.concatenate([view.of_state(x), privileged])
         obs = view(x if world is None else world.measured, past)
@@ -140,14 +169,18 @@ class Env:
             x = jnp.where(jax.random.bernoulli(key_where, share), near, x)
         if share := config.random_starts:
             # Among the episodes that do not start near upright, so that both shares are right.
-            share = (
-                min(share / (1 - config.upright_starts), 1.0) if config.upright_starts < 1 else 0
-            )
+            share = _among(share, config.upright_starts)
             key_where, key_angles, key_speeds = jax.random.split(jax.random.fold_in(key, 2), 3)
             angles = jax.random.uniform(key_angles, (2,), minval=-jnp.pi, maxval=jnp.pi)
             speeds = START_SPEED * jax.random.normal(key_speeds, (2,))
             anywhere = jax.random.bernoulli(key_where, share) & ~jnp.any(x)
             x = jnp.where(anywhere, jnp.concatenate([angles, speeds]), x)
+        if share := config.thrown_starts:
+            share = _among(share, config.upright_starts + config.random_starts)
+            key_where, key_which = jax.random.split(jax.random.fold_in(key, 3))
+            states = jnp.asarray(_thrown_states(self.task), x.dtype)
+            state = states[jax.random.randint(key_which, (), 0, THROWN)]
+            x = jnp.where(jax.random.bernoulli(key_where, share) & ~jnp.any(x), state, x)
         return x
 
     def step(self, state: EnvState, action: jax.Array) -> EnvState:
@@ -191,7 +224,8 @@ class Env:
         """The factors, 1 or -1, that mirror ``obs`` (obs_size,) and ``privileged``."""
         view = self.config.observation
         true = dataclasses.replace(view, history=0).mirrored if self.config.randomised else ()
-        return view.mirrored, (*true, -1)
+        turns = (-1, -1) if self.config.reward.turns else ()
+        return view.mirrored, (*true, *turns, -1)
 
 
 def truncated(config: EnvConfig, state: EnvState, steps: jax.Array) -> jax.Array:

@@ -37,8 +37,9 @@ from .controllers.policy import Policy
 from .controllers.search_space import coordinates
 from .criteria import EPSILON, upright
 from .errors import JaxpendError
-from .plant import rk4_step
+from .plant import rk4_step, tip_height
 from .pytree import Pytree, pytree
+from .resets import thrown
 from .rollout import rollout
 from .scenario import Scenario
 from .stage import Candidates, Chart, Row, SearchStage, SearchState, Stage
@@ -94,6 +95,22 @@ def performance(config: GradientConfig, controller: Controller, task: Task) -> j
     line, power = jnp.asarray(config.line_width), jnp.asarray(config.power_width)
     p = SwingUp(task.plant, None, None, line, power, task, task.dt)
     return smooth_score(p, totals(p, run.x, run.u[:, task.joint]))
+
+
+def time_up(
+    config: GradientConfig, controller: Controller, task: Task, key: jax.Array
+) -> jax.Array:
+    """Smooth share of ``config.duration`` s that the tip is above the line, after a reset by hand.
+
+    ``key`` is consumed: it draws the state in which the reset leaves an arm that stood.
+    """
+    key_start, key_run = jax.random.split(key)
+    plant, both = task.plant, task.with_resets(Scenario(task.plant), None).plant
+    x0 = jax.lax.stop_gradient(thrown(both, key_start, task.dt))
+    options = {"duration": config.duration, "integrator": _fading(config.memory)}
+    run = rollout(Scenario(plant, x0=x0), controller, key_run, dt=task.dt, **options)
+    line = task.height * jnp.sum(plant.length)
+    return jax.nn.sigmoid((tip_height(plant.length, run.x) - line) / config.line_width).mean()
 
 
 def uprightness(x: jax.Array) -> jax.Array:
@@ -165,9 +182,19 @@ def slope(config: GradientConfig, start: Controller, task: Task, z: jax.Array, k
     ``start`` is the origin of the coordinates; ``key`` is consumed.
     """
     rebuild = coordinates(start, config.searched)[-1]
-    found = jax.value_and_grad(lambda z: performance(config, rebuild(z), task))(z)
-    value, ascent, finite = _usable(config, *found)
-    lost, metrics = 1 - finite.astype(jnp.int32), {"smooth_score": value}
+    if task.resets:
+        key, key_starts = jax.random.split(key)
+        of_one = jax.value_and_grad(lambda z, key: time_up(config, rebuild(z), task, key))
+        found = jax.vmap(of_one, (None, 0))(z, jax.random.split(key_starts, config.starts))
+        values, ascents, finite = jax.vmap(partial(_usable, config))(*found)
+        kept = jnp.maximum(finite.sum(), 1)
+        value, ascent = values.sum() / kept, ascents.sum(axis=0) / kept
+        lost = jnp.sum(~finite, dtype=jnp.int32)
+    else:
+        found = jax.value_and_grad(lambda z: performance(config, rebuild(z), task))(z)
+        value, ascent, finite = _usable(config, *found)
+        lost = 1 - finite.astype(jnp.int32)
+    metrics = {"smooth_score": value}
     if not config.scenarios:
         return ascent, lost, metrics
     keys = jax.random.split(key, 2 * config.scenarios)

@@ -5,7 +5,7 @@ benchmark in float32, as ``jaxpend robustness`` runs it.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,7 @@ def judge(
     with jax.enable_x64(True):
         found = official(make(board.task.plant), board)
     result = {name: found[name] for name in ("score", "success", "criteria")}
-    if not robustness:
+    if not robustness or board.trials is None:
         return result | {"robustness": None}
     start = time.perf_counter()
     with jax.enable_x64(False):
@@ -81,10 +81,11 @@ def leaderboard(
         row = {"name": name, "title": title, "source": "measured"}
         rows.append(row | judge(make, board, **options))
     rows += published(board)
-    return {"robot": board.robot, "rows": sorted(rows, key=lambda row: -row["score"])}
+    rows = sorted(rows, key=lambda row: -row["score"])
+    return {"robot": board.robot, "columns": board.columns, "rows": rows}
 
 
-def cells(row: Mapping[str, Any]) -> list[str]:
+def cells(row: Mapping[str, Any], columns: Sequence[str]) -> list[str]:
     """A row of a board as text: title, score, criteria, six robustness scores, robustness."""
 
     def shown(value: float | None, form: str) -> str:
@@ -95,7 +96,7 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     return [
         row["title"] + (" (published)" if row["source"] == "published" else ""),
         shown(row["score"], ".3f"),
-        *(shown(criteria.get(name), form) for name, (_, _, form, _) in HEADINGS.items()),
+        *(shown(criteria.get(name), HEADINGS[name][2]) for name in columns),
         *(shown(six.get(name), ".2f") for name in CRITERIA),
         shown(row["robustness"], ".3f"),
     ]
@@ -103,11 +104,13 @@ def cells(row: Mapping[str, Any]) -> list[str]:
 
 def markdown(board: Mapping[str, Any]) -> str:
     """The board as a Markdown table; of several keys, median and range of the robustness."""
-    criteria = [f"{heading} [{unit}]" for heading, unit, *_ in HEADINGS.values()]
+    columns = board["columns"]
+    shown = [HEADINGS[name] for name in columns]
+    criteria = [f"{heading} [{unit}]" for heading, unit, *_ in shown]
     headings = ["controller", "score", *criteria, *CRITERIA.values(), "robustness"]
     lines = [headings, ["---"] + ["---:"] * (len(headings) - 1)]
     for row in board["rows"]:
-        line, by_key = cells(row), row.get("robustness_by_key", ())
+        line, by_key = cells(row, columns), row.get("robustness_by_key", ())
         if len(by_key) > 1:
             line[-1] += f" ({min(by_key):.3f} to {max(by_key):.3f})"
         lines.append(line)
@@ -130,7 +133,7 @@ def chosen(
     chosen: dict[str, tuple[str, Make]] = {}
     for name in names:
         title = CATALOGUE[choose("controller", name, CATALOGUE)].title
-        chosen[name] = title, partial(build, name, robot=robot)
+        chosen[name] = title, partial(build, name, robot=robot, policy=task.shipped)
     if policy or controller:
         if not controller or ":" in controller:  # what is wrong is known at once, and cheaply
             find_controller(policy, controller, task)

@@ -5,10 +5,12 @@ from pathlib import Path
 
 from .errors import choose
 
-__all__ = ["ROBOTS", "active_joint", "shipped"]
+__all__ = ["ROBOTS", "SHIPPED", "active_joint", "shipped"]
 
 # Driven joint of each robot.
 ROBOTS = {"acrobot": 1, "pendubot": 0}
+# Policies that ship: those of the v2 boards by the robot's name, and those of the v3 boards.
+SHIPPED = (*ROBOTS, *(f"global_{robot}" for robot in ROBOTS))
 
 
 def active_joint(robot: str) -> int:
@@ -20,7 +22,7 @@ def active_joint(robot: str) -> int:
 
 
 def shipped(robot_or_path: str | Path, folder: str) -> Path:
-    """The file in ``folder`` that ships for a robot, by its name; else the path itself."""
-    if str(robot_or_path) not in ROBOTS:
+    """The file in ``folder`` that ships, by its name in ``SHIPPED``; else the path itself."""
+    if str(robot_or_path) not in SHIPPED:
         return Path(robot_or_path)
     return Path(str(resources.files(__package__).joinpath(f"{folder}/{robot_or_path}.npz")))

@@ -176,6 +176,8 @@ def benchmark(
     if isinstance(judged_on, Board | str):
         official = board(judged_on)
         check_robot(controller, official.robot)
+        if official.trials is None:
+            raise JaxpendError(f"the {official.name} board has no robustness benchmark")
         task, trials = official.task, official.trials
         grid = {"dt": task.dt, "duration": task.duration}
         options = grid | {"scoring": task.scoring, "height": task.height} | options

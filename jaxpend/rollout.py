@@ -13,6 +13,7 @@ from .controller import Controller, check_form
 from .errors import JaxpendError
 from .plant import Plant, rk4_step
 from .pytree import Pytree, pytree
+from .resets import begun, push
 from .scenario import DT, DURATION, Scenario
 
 __all__ = ["Trajectory", "actuate", "draws", "final_state", "measure", "rollout", "time_stamps"]
@@ -101,21 +102,27 @@ def _closed_loop(
     }
 
     def step(carry, now):
-        x, u, memory, history = carry
+        x, u, memory, hand, history = carry
         history, measured = measure(scenario, history, now["k"], x, now["z"])
-        memory, command = controller(memory, now["t"], measured)
+        after, command = controller(memory, now["t"], measured)
         command = jnp.asarray(command, dtype)
         if command.shape != (2,):
             name = type(controller).__name__
             raise JaxpendError(f"{name} returns a torque of shape {command.shape}; it must be (2,)")
+        if scenario.resets is not None:  # to the controller it is as if time had jumped
+            holds, hand, torque = push(scenario.resets, hand, plant, now["k"], measured)
+            command = jnp.where(holds, torque, command)
+            after = jax.tree.map(lambda old, new: jnp.where(holds, old, new), memory, after)
         u = actuate(scenario, command, u, now["t_pulse"], now["z"])
         x_next = integrator(plant, x, u, dt)
         if scenario.process_noise is not None:
             x_next = x_next + scenario.process_noise * now["z"]["process_noise"]
-        return (x_next, u, memory, history), (x, u, measured, command) if record else None
+        carry = x_next, u, after, hand, history
+        return carry, (x, u, measured, command) if record else None
 
     history = None if scenario.delay is None else jnp.broadcast_to(x0, (delay_slots, 4))
-    start = (x0, jnp.zeros(2, dtype), controller.reset(controller_key), history)
+    hand = None if scenario.resets is None else begun(dtype)
+    start = (x0, jnp.zeros(2, dtype), controller.reset(controller_key), hand, history)
     (x_end, *_), recorded = jax.lax.scan(step, start, inputs)
     if not record:
         return x_end

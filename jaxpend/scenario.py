@@ -14,6 +14,7 @@ import numpy as np
 from .errors import JaxpendError, choose
 from .plant import Plant
 from .pytree import Pytree, pytree
+from .resets import Resets
 
 __all__ = [
     "DT", "DURATION", "NEUTRAL", "Pulses", "Scenario", "check_values", "delay_steps",
@@ -51,6 +52,7 @@ class Scenario(Pytree):
     torque_noise: jax.Array | None = None  # (2,) N m, standard deviation
     responsiveness: jax.Array | None = None  # () fraction of the commanded change made per step
     pulses: Pulses | None = None
+    resets: Resets | None = None  # by hand, in which the controller is not called
 
     @property
     def dtype(self):

@@ -29,18 +29,20 @@ from .criteria import (
 )
 from .errors import JaxpendError
 from .plant import Plant
+from .resets import held
 from .rollout import Trajectory, rollout
 from .scenario import Scenario
 from .variations import LONGEST_DELAY
 
 __all__ = [
     "V1_DEFAULT", "V1_OFFICIAL", "V2_HARDWARE", "V2_OFFICIAL", "Criteria", "ScoreV2", "ScoreV3",
-    "combined", "criteria", "imperfect", "nominal", "nominal_run", "official", "official_run",
-    "performance", "recorded", "score_v1", "score_v2", "score_v3",
+    "combined", "criteria", "imperfect", "nominal", "official", "official_run", "performance",
+    "recorded", "score_v1", "score_v2", "score_v3", "trial_run",
 ]  # fmt: skip
 
 # N m, with which a robot's passive joint may be driven against its friction.
 PASSIVE = 0.5
+CHUNK = 50  # draws of a board that are judged at a time
 
 
 def performance(
@@ -86,16 +88,39 @@ def combined(
 
 @partial(jax.jit, static_argnames="task")
 def nominal(controller: Controller, task: Task) -> Criteria:
-    """``performance`` on the nominal plant, compiled once a kind of controller."""
-    return performance(controller, task.plant, jax.random.key(0), task)
+    """``performance`` on the nominal plant, compiled once a kind of controller.
+
+    Of a task in which chance plays it is that of ``task.trials`` runs (trials,), always the same.
+    """
+    key = jax.random.key(0)
+    if task.trials == 1:
+        return performance(controller, task.trial(key), key, task)
+    keys = jax.random.split(key, task.trials)
+    return jax.vmap(lambda key: performance(controller, task.trial(key), key, task))(keys)
 
 
 @partial(jax.jit, static_argnames="task")
-def nominal_run(controller: Controller, task: Task) -> tuple[Trajectory, Criteria]:
-    """What ``nominal`` judges, and its criteria."""
-    key = jax.random.key(0)
-    run = rollout(task.plant, controller, key, dt=task.dt, duration=task.duration)
-    return run, task.criteria(run)
+def trial_run(
+    controller: Controller, scenario: Scenario | None, task: Task
+) -> tuple[Trajectory, Criteria, jax.Array]:
+    """A run on the time grid of a task, its criteria, and how hard it drove the passive joint.
+
+    The last is the largest torque (), N m, that the controller wanted there. Without a scenario it
+    is on the nominal plant, whose numbers are then constants of the program.
+    """
+    key, scenario = jax.random.key(0), scenario or Scenario(task.plant)
+    run = rollout(scenario, controller, key, dt=task.dt, duration=task.duration)
+    passive = jnp.abs(run.u_command[:, 1 - task.joint])
+    if scenario.resets is not None:
+        passive = jnp.where(
+            held(scenario.resets, np.arange(len(passive))).any(axis=-1), 0.0, passive
+        )
+    return run, task.criteria(run), passive.max()
+
+
+@partial(jax.jit, static_argnames="task")
+def _trials(controller: Controller, scenarios: Scenario, task: Task) -> tuple[Criteria, jax.Array]:
+    return jax.vmap(lambda scenario: trial_run(controller, scenario, task)[1:])(scenarios)
 
 
 @partial(jax.jit, static_argnames="task")
@@ -103,15 +128,19 @@ def _criteria(run: Trajectory, task: Task) -> Criteria:
     return task.criteria(run)
 
 
-def _in_float64(leaf: Any) -> Any:
-    return jnp.asarray(leaf, "f8") if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) else leaf
+def _in_default(leaf: Any) -> Any:
+    floating = jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+    return jnp.asarray(leaf, jnp.result_type(float)) if floating else leaf
 
 
 def _ready(controller: Controller, task: Task) -> Controller:
-    """The controller in float64. Raises ``JaxpendError`` if it cannot be judged on the task."""
+    """The controller in jax's default float type.
+
+    Raises ``JaxpendError`` if it cannot be judged on the task.
+    """
     check_form(controller)
     check_robot(controller, task.robot)
-    controller = jax.tree.map(_in_float64, controller)
+    controller = jax.tree.map(_in_default, controller)
     check_controller(controller)
     return controller
 
@@ -119,29 +148,70 @@ def _ready(controller: Controller, task: Task) -> Controller:
 def official(controller: Controller, judged_on: Board | str) -> dict[str, Any]:
     """Score, success and criteria of a controller as plain numbers, computed in float64.
 
+    Of a board of several draws, all but the robot are means over them, computed in float32;
+    "draws" says how many there are, and of their scores the standard deviation and the interval
+    in which the mean is with 95 % confidence. It succeeds if no run diverges.
+
     Args:
         controller: any controller.
         judged_on: a board, or "acrobot" or "pendubot" for the v2 board of that robot.
 
     Raises:
-        JaxpendError: it is no controller, or one of the other robot.
+        JaxpendError: it is no controller, one of the other robot, or one that drives the passive
+            joint where the plant would let it.
     """
-    task = board(judged_on).task
-    with jax.enable_x64(True):
-        return _plain(nominal(_ready(controller, task), task), task)
+    judged_on = board(judged_on)
+    if judged_on.seeds == 1:
+        return official_run(controller, judged_on)[1]
+    task, found = judged_on.task, []
+    with jax.enable_x64(False):
+        ready = _ready(controller, task)
+        for first in range(0, judged_on.seeds, CHUNK):
+            seeds = range(first, min(first + CHUNK, judged_on.seeds))
+            scenarios = [judged_on.drawn(seed) for seed in seeds]
+            batch = jax.tree.map(lambda *leaves: np.stack(leaves), *scenarios)
+            c, passive = _trials(ready, batch, task)
+            _refuse_passive(float(passive.max()), task)
+            found.append(jax.tree.map(np.asarray, c))
+    c = jax.tree.map(lambda *parts: np.concatenate(parts).astype(float), *found)
+    scores = np.asarray(task.score(c), float)
+    spread = float(scores.std(ddof=1))
+    mean, error = float(scores.mean()), 1.96 * spread / len(scores) ** 0.5
+    names = [name for name in vars(c) if name != "success"]
+    return {
+        "robot": task.robot,
+        "score": mean,
+        "success": not c.diverged.any(),
+        "diverged": bool(c.diverged.any()),
+        "criteria": {name: float(getattr(c, name).mean()) for name in names},
+        "draws": {"count": len(scores), "std": spread, "interval": [mean - error, mean + error]},
+    }
 
 
 def official_run(
-    controller: Controller, judged_on: Board | str
+    controller: Controller, judged_on: Board | str, seed: int = 0
 ) -> tuple[Trajectory, dict[str, Any]]:
-    """The run that ``official`` judges, in float64, and what ``official`` says of it.
+    """A run that ``official`` judges, in float64, and its score, success and criteria.
 
-    Arguments and errors are those of ``official``.
+    ``seed`` is that of the draw, on a board of several; other arguments, and errors, are those of
+    ``official``.
     """
-    task = board(judged_on).task
+    judged_on = board(judged_on)
+    task = judged_on.task
     with jax.enable_x64(True):
-        run, c = nominal_run(_ready(controller, task), task)
+        ready = _ready(controller, task)
+        run, c, passive = trial_run(ready, judged_on.drawn(seed), task)
+        _refuse_passive(float(passive), task)
         return run, _plain(c, task)
+
+
+def _refuse_passive(torque: float, task: Task) -> None:
+    """Refuse a controller that drives the passive joint, where it is not held by the plant."""
+    if task.resets and torque > 0:
+        raise JaxpendError(
+            f"the controller drives joint {2 - task.joint} with up to {torque:.3g} N m; the "
+            f"{task.robot} is driven at joint {task.joint + 1} alone"
+        )
 
 
 def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -> dict[str, Any]:
@@ -176,13 +246,13 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
             f"of this board starts at 0 and has steps of {task.dt:g} s (a robot's: --hardware)"
         )
     driven, passive = (float(abs(u[:, joint]).max()) for joint in (task.joint, 1 - task.joint))
-    if passive > (1e-6 if regular else max(driven, PASSIVE)):
+    if passive > (1e-6 if regular else max(driven, PASSIVE)) and not task.resets:
         raise JaxpendError(
             f"joint {2 - task.joint} has torques of up to {passive:.3g} N m, but the {task.robot} "
             f"is driven at joint {task.joint + 1}; the run is that of another robot"
         )
     with jax.enable_x64(True):
-        return _plain(_criteria(jax.tree.map(_in_float64, run), task), task)
+        return _plain(_criteria(jax.tree.map(_in_default, run), task), task)
 
 
 def _plain(c: Criteria, task: Task) -> dict[str, Any]:

@@ -53,18 +53,17 @@ def fitness(
 ) -> tuple[jax.Array, jax.Array]:
     """Fitness of a controller, to be maximised, and how many of its rollouts diverged.
 
-    The mean score of the task over noisy nominal rollouts; with ``config.scenarios`` what
+    The mean score of the task over its noisy trials; with ``config.scenarios`` what
     ``score.combined`` makes of it and of random imperfect scenarios of the task. ``task`` may be
     left out for a controller that knows its robot (``boards.own_task``).
     """
     task = own_task(controller, task)
-    plant = task.plant
     key_noise, key_scenarios = jax.random.split(key)
     noise = jnp.asarray(config.action_noise, jnp.float32) if config.action_noise else None
     noisy, policies = change_policies(controller, lambda p: p.replace(action_noise=noise))
-    draws = policies and config.action_noise
+    draws = task.resets or (policies and config.action_noise)
     keys = jax.random.split(key_noise, config.rollouts if draws else 1)
-    c = jax.vmap(lambda k: performance(noisy, plant, k, task))(keys)
+    c = jax.vmap(lambda k: performance(noisy, task.trial(k), k, task))(keys)
     score, diverged = task.score(c).mean(), jnp.sum(c.diverged)
     if config.scenarios:
         met = imperfect(controller, task, key_scenarios, config.scenarios)

@@ -177,7 +177,7 @@ class SearchStage(Stage[Controller, SearchState, Controller]):
 
     def compared(self, controller: Controller) -> tuple[float, float]:
         """The official score of a candidate, and what it is compared by."""
-        score = float(self.task.score(nominal(controller, self.task)))
+        score = float(self.task.score(nominal(controller, self.task)).mean())
         return score, value(self.config.objective, controller, score, self.task)
 
     def rekey(self, state: SearchState, number: int) -> SearchState:

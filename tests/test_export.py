@@ -101,9 +101,10 @@ def test_the_loop_that_an_exported_controller_closes_is_the_same():
 
 def in_c(name, folder, precision="float32"):
     """A library whose ``run`` takes a number of steps N, times, states (N, 4), torques (N, 2)."""
-    text = to_c.source(controller(name, precision), prefix="our", precision=precision)
+    arrays = "float32" if precision == "float32" else "float64"
+    text = to_c.source(controller(name, arrays), prefix="our", precision=precision)
     (folder / "controller.h").write_text(text)
-    real = "float" if precision == "float32" else "double"
+    real = "double" if precision == "float64" else "float"
     (folder / "loop.c").write_text(LOOP.replace("float", real))
     flags = "-std=c99 -Wall -Wextra -Werror -O2 -shared -fPIC loop.c -o loop.so -lm"
     subprocess.run(["gcc", *flags.split()], cwd=folder, check=True)
@@ -133,6 +134,17 @@ def test_c_in_double_gives_the_same_torques_on_the_same_measurements(name, tmp_p
     for x, u in zip(states, found, strict=True):
         library.run(len(times), *(floats(a, ctypes.c_double) for a in (times, x, u)))
     np.testing.assert_allclose(found, torques, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_c_in_mixed_precision_gives_the_same_torques_on_the_same_floats(name, tmp_path):
+    times, states, _ = recorded(name, "float64")
+    times, states = times.astype("f4"), np.ascontiguousarray(states, "f4")
+    library, found = in_c(name, tmp_path, "mixed"), np.empty((*states.shape[:2], 2), "f4")
+    for x, u in zip(states, found, strict=True):
+        library.run(len(times), floats(times), floats(x), floats(u))
+    ours = [replayed(in_numpy(name), times.astype(float), x.astype(float)) for x in states]
+    np.testing.assert_allclose(found, ours, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -352,6 +364,11 @@ def test_the_command_exports_in_either_precision(monkeypatch, capsys, tmp_path):
         code, _, said = run(monkeypatch, capsys, [*line, "float32", *out])
         assert code == 2
         assert f"--precision is float32; {to} computes in float64" in said
+    code, _, said = run(monkeypatch, capsys, [*line, "mixed", "--to", "onnx", "--out", "x.onnx"])
+    assert (code, "onnx computes in float32 or float64" in said) == (2, True)
+    mixed = [*line, "mixed", "--to", "c", "--out", str(tmp_path / "mixed.h")]
+    assert run(monkeypatch, capsys, mixed)[0] == 0
+    assert "mixed_step(mixed_state *s, float t, const" in (tmp_path / "mixed.h").read_text()
 
 
 def run(monkeypatch, capsys, arguments):

@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parents[1] / "jaxpend"
 LAYERS = """
 errors files arrays robots pytree fields observation config config_files terminal
 plant
-designs
+designs resets
 scenario
 variations
 stepping

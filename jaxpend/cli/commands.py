@@ -13,10 +13,10 @@ from typing import Literal
 
 from ..config import GradientRun, Run, SACRun, Search, SNESRun, TrainRun
 from ..errors import JaxpendError
-from ..fields import Count, Natural, Positive, Robot, Seed
+from ..fields import BoardName, Count, Natural, Positive, Robot, Seed
 from .exporting import export as export
 from .importing import import_ as import_
-from .judging import Subject, board_of
+from .judging import Subject, board_of, of_draws
 from .output import ARRAYS, JSON, MARKDOWN, check_file, check_folder, emit, emit_json
 
 
@@ -46,7 +46,7 @@ def snes(config: SNESRun, command: str) -> None:
 
 def execute(config: Run, command: str) -> None:
     """``train.train``, then the score table, and where the results are."""
-    board = board_of(config.robot, config.plant, config.design)
+    board = board_of(config.robot, config.plant, config.design, config.board)
     from ..runs.reader import read_run
     from ..terminal import console
     from ..train import train
@@ -117,11 +117,18 @@ def score(
     hardware: bool = False,
     save: str | None = None,
     json: str | None = None,
+    board: BoardName = "v2",
+    seed: Seed | None = None,
+    draws: Count | None = None,
 ) -> None:
-    """Official v2 score of a policy, of any other controller, or of a recorded run, in float64.
+    """Official score of a policy, of any other controller, or of a recorded run.
+
+    It is computed in float64; of a board on which chance plays, it is the mean of a thousand draws
+    in float32.
 
     Args:
         robot: which joint is driven: the second of the acrobot, the first of the pendubot.
+        board: v2, or v3, the one of global policies.
         policy: a policy or controller file; by default the policy that ships with the package.
         controller: judge this instead: a known one such as tvlqr, or module:name of a
             controller, of one written for RealAIGym, or of a Python function (t, x) -> torque.
@@ -129,6 +136,8 @@ def score(
             your own classes.
         plant: YAML file of the parameters of another plant than that of the boards.
         design: or an identified plant by name, such as C.1/1.0.
+        seed: on a board on which chance plays, judge this draw alone, in float64.
+        draws: or the first so many; by default all of the board, 1000 of v3.
         csv: judge this recorded trajectory instead, a file in the layout of RealAIGym.
         hardware: with the normalisation for real robots; a recording may then have a clock
             that is not exact.
@@ -138,22 +147,28 @@ def score(
     check_file(json, JSON)
     check_file(save)
     _apart(json=json, save=save)
-    subject = Subject(robot, policy, controller, plant, design)
+    subject = Subject(robot, policy, controller, plant, design, on=board)
     from .. import boards
     from .tables import score_table
 
-    board = boards.hardware(subject.board) if hardware else subject.board
+    judged_on = boards.hardware(subject.board) if hardware else subject.board
+    if seed is not None and judged_on.seeds == 1:
+        raise JaxpendError(f"--seed names a draw, of which the {board} board has none")
+    judged_on = of_draws(judged_on, draws)
     if save is not None:
+        if seed is None and judged_on.seeds > 1:
+            raise JaxpendError("--save writes one run; name its draw, such as --seed 0")
         from ..interop.csv import check_target
 
         check_target(save)
     if csv is None:
         about, name = subject.about, subject.name
-        result = _scored(subject, board, save) | about
+        result = _scored(subject, judged_on, seed, save) | about
     else:
-        result, name = _recorded(csv, subject, board, hardware, save), csv
+        result, name = _recorded(csv, subject, judged_on, hardware, save), csv
     if json != "-":
-        score_table({name: result}, board)
+        one = seed is not None or csv is not None
+        score_table({name: result}, dataclasses.replace(judged_on, seeds=1) if one else judged_on)
     emit_json(result, json)
 
 
@@ -165,7 +180,7 @@ def _apart(**files):
         raise JaxpendError(f"--{first} and --{second} are both {one}; name two files")
 
 
-def _scored(subject, board, save):
+def _scored(subject, board, seed, save):
     """What ``official`` says of a controller, and its run in a file."""
     import jax
 
@@ -173,12 +188,13 @@ def _scored(subject, board, save):
 
     with jax.enable_x64(True):
         judged = subject.find(board)
-    if save is None:
+    if save is None and seed is None:
         return official(judged, board)
-    from ..interop.csv import save_csv
+    run, result = official_run(judged, board, seed or 0)
+    if save is not None:
+        from ..interop.csv import save_csv
 
-    run, result = official_run(judged, board)
-    save_csv(save, run)
+        save_csv(save, run)
     return result
 
 
@@ -287,11 +303,15 @@ def leaderboard(
     seed: Seed = 0,
     json: str | None = None,
     out: Path | None = None,
+    board: BoardName = "v2",
+    draws: Count | None = None,
 ) -> None:
     """Judge controllers on performance and robustness, next to the published ones.
 
     Args:
         robot: which joint is driven: the second of the acrobot, the first of the pendubot.
+        board: v2, or v3, the one of global policies, which has no robustness.
+        draws: of v3, to take the mean of; by default 1000, which takes MPC hours.
         controllers: names separated by commas; by default all that are known.
         policy: a policy or controller file to judge as well.
         controller: or another one to judge as well, as in jaxpend score.
@@ -313,12 +333,12 @@ def leaderboard(
     def say(line: str) -> None:
         console.print(line, style="dim")
 
-    board = board_of(robot, plant, design)
-    chosen = boards.chosen(controllers, policy, controller, board.task)
+    judged_on = of_draws(board_of(robot, plant, design, board), draws)
+    chosen = boards.chosen(controllers, policy, controller, judged_on.task)
     options = {"robustness": robustness, "keys": keys, "seed": seed}
-    result = boards.leaderboard(board, chosen, say=say, **options)
+    result = boards.leaderboard(judged_on, chosen, say=say, **options)
     result |= {"plant": plant, "design": design}
-    leaderboard_table(result, board)
+    leaderboard_table(result, judged_on)
     emit_json(result, json)
     emit(boards.markdown(result), out)
 

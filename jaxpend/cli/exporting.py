@@ -19,7 +19,7 @@ def export(
     /,
     to: Literal["numpy", "onnx", "c", "realaigym"],
     out: Path,
-    precision: Literal["float32", "float64"] | None = None,
+    precision: Literal["float32", "float64", "mixed"] | None = None,
 ) -> None:
     """A policy or controller as a file for where there is no jax.
 
@@ -35,11 +35,14 @@ def export(
         out: file to write; for realaigym a folder, whose name the submission has.
         precision: what onnx and c compute in, float32 unless told; numpy has float64 alone. A
             guard's observer multiplies rounding: in float32 torques are within 3e-3 N m of those
-            here, in float64 within 1e-9.
+            here, in float64 within 1e-9. mixed, for c: float goes in and comes out, double
+            computes, within 1e-5.
     """
-    if to in ("numpy", "realaigym") and precision == "float32":
-        text = f"--precision is float32; {to} computes in float64 alone: leave it out"
+    if to in ("numpy", "realaigym") and precision not in (None, "float64"):
+        text = f"--precision is {precision}; {to} computes in float64 alone: leave it out"
         raise JaxpendError(f"{text}, or export to onnx or c")
+    if to == "onnx" and precision == "mixed":
+        raise JaxpendError("--precision is mixed; onnx computes in float32 or float64")
     if to == "realaigym":
         return _submit(policy, out)
     _check_out(out)
@@ -49,7 +52,7 @@ def export(
     from ..terminal import console
 
     precision = precision or ("float64" if to == "numpy" else "float32")
-    with jax.enable_x64(precision == "float64"):
+    with jax.enable_x64(precision != "float32"):
         controller = load_controller(policy)
     content = _content(controller, to, out, precision)
     from ..files import write_atomically

@@ -3,22 +3,36 @@
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
+from ..errors import JaxpendError
+
 if TYPE_CHECKING:
     from ..boards import Board
     from ..controller import Controller
 
-__all__ = ["Subject", "board_of"]
+__all__ = ["Subject", "board_of", "of_draws"]
 
 
-def board_of(robot: str, plant: str | None, design: str | None) -> "Board":
-    """The v2 board of a robot; on another plant its scores are not comparable to published ones."""
-    from ..boards import task_of, v2
+def board_of(robot: str, plant: str | None, design: str | None, name: str = "v2") -> "Board":
+    """A board of a robot; on another plant its scores are not comparable to published ones."""
+    from ..boards import named_board, task_of
 
-    official, task = v2(robot), task_of(robot, plant, design)
+    official, task = named_board(robot, name), task_of(robot, plant, design, name)
     if not (plant or design):
         return official
     name = f"{official.name} on {plant or design}"
     return dataclasses.replace(official, name=name, task=task, published=())
+
+
+def of_draws(board: "Board", draws: int | None) -> "Board":
+    """The board with so many official draws; None: all of them.
+
+    Raises ``JaxpendError`` where there are not so many.
+    """
+    if draws is None:
+        return board
+    if draws > board.seeds:
+        raise JaxpendError(f"--draws is {draws}; the {board.name} board has {board.seeds}")
+    return dataclasses.replace(board, seeds=draws)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,11 +45,12 @@ class Subject:
     plant: str | None = None
     design: str | None = None
     torque_limit: float | None = None  # N m, of the driven joint; None: that of the board
+    on: str = "v2"  # name of the board
 
     @property
     def board(self) -> "Board":
         """The board to judge on."""
-        board = board_of(self.robot, self.plant, self.design)
+        board = board_of(self.robot, self.plant, self.design, self.on)
         if self.torque_limit is None:
             return board
         task = dataclasses.replace(board.task, torque_limit=self.torque_limit)
@@ -54,7 +69,7 @@ class Subject:
         """
         from ..controllers.files import read_header
 
-        file = self.policy or (None if self.controller else self.robot)
+        file = self.policy or (None if self.controller else self.board.task.shipped)
         said = {"policy": file, "controller": self.controller, "plant": self.plant}
         return said | {"design": self.design, "header": read_header(file) if file else None}
 

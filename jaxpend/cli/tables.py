@@ -31,10 +31,12 @@ def score_table(results: Mapping[str, Mapping], board: "Board") -> None:
     """Print results of ``score.official``, a column each, and the published scores."""
     from ..boards import HEADINGS  # loads jax
 
-    table = _table("", *results, title=f"{board.robot}, {board.name}: score (float64)")
+    how = f"mean of {board.seeds} draws" if board.seeds > 1 else "float64"
+    table = _table("", *results, title=f"{board.robot}, {board.name}: score ({how})")
     table.add_row("score", *(Text(f"{r['score']:.4f}", "bold") for r in results.values()))
     table.add_row("success", *("yes" if r.get("success") else "no" for r in results.values()))
-    for name, (heading, unit, form, _) in HEADINGS.items():
+    for name in board.columns:
+        heading, unit, form, _ = HEADINGS[name]
         cells = (_criterion(result, name, form) for result in results.values())
         table.add_row(f"{heading} [{unit}]", *cells)
     console.print(table)
@@ -91,9 +93,10 @@ def leaderboard_table(result: Mapping[str, Any], board: "Board") -> None:
     from ..leaderboard import cells
 
     # Words below one another, so that all columns fit.
-    short = [f"{name}\n[{unit}]" for _, unit, _, name in HEADINGS.values()]
+    short = [f"{name}\n[{unit}]" for _, unit, _, name in map(HEADINGS.__getitem__, board.columns)]
     six = [name.replace(" ", "\n").replace("Perturbations", "Pulses") for name in CRITERIA.values()]
-    parts = {"performance (float64)": (["score", *short], slice(0, 1 + len(short)))}
+    how = f"mean of {board.seeds} draws" if board.seeds > 1 else "performance (float64)"
+    parts = {how: (["score", *short], slice(0, 1 + len(short)))}
     if any(row["source"] == "measured" and row["robustness"] for row in result["rows"]):
         parts["robustness"] = ([*six, "all six"], slice(1 + len(short), None))
     for title, (headings, part) in parts.items():
@@ -107,7 +110,9 @@ def leaderboard_table(result: Mapping[str, Any], board: "Board") -> None:
         for row in result["rows"]:
             published = row["source"] == "published"
             name = row["title"] + "*" * published
-            table.add_row(name, *cells(row)[1:][part], style="dim" if published else None)
+            table.add_row(
+                name, *cells(row, board.columns)[1:][part], style="dim" if published else None
+            )
         console.print(table)
 
 
@@ -151,7 +156,7 @@ def _row(run: Mapping[str, Any]) -> tuple[str, ...]:
 
 def seeds_table(group: Mapping[str, Any]) -> None:
     """Print a ``runs.statistics.summary``."""
-    title = f"{group['robot']}: official v2 score of {len(group['seeds'])} seeds"
+    title = f"{group['robot']}: official score of {len(group['seeds'])} seeds"
     headings = ("", "median", "interquartile mean", "95 %", "lowest to highest")
     table = _table(*headings, title=title)
     for found in group["stages"].values():

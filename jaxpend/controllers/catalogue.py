@@ -28,64 +28,72 @@ from .tvlqr import tvlqr
 __all__ = ["CATALOGUE", "Entry", "build", "find_controller"]
 
 
-Make = Callable[[Plant, str], Controller]
+# (plant, robot, name or file of the policy it is built around) -> controller
+Make = Callable[[Plant, str, str], Controller]
 
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """A way to make a controller for a plant and a robot."""
+    """A way to make a controller for a plant and a robot, around a policy where it takes one."""
 
     title: str
     make: Make
 
 
-def _network(plant: Plant, robot: str) -> Controller:
-    return network_in(load_policy(robot))
+def _network(plant: Plant, robot: str, policy: str) -> Controller:
+    return network_in(load_policy(policy))
 
 
-def _open_loop(plant: Plant, robot: str) -> Controller:
+def _open_loop(plant: Plant, robot: str, policy: str) -> Controller:
     reference = load_reference(robot)
     torques = reference.both(reference.u[:, None])
     # Half a step early, so that rounding in the sum of time steps does not matter.
     return OpenLoop(reference.dt * (jnp.arange(reference.steps) - 0.5), torques)
 
 
+def _alone(make: Callable[[Plant, str], Controller]) -> Make:
+    return lambda plant, robot, policy: make(plant, robot)
+
+
 def _along(make: Callable[[Plant, Reference], Controller]) -> Make:
     """Along the swing-up that ships with the package."""
-    return lambda plant, robot: make(plant, load_reference(robot))
+    return lambda plant, robot, policy: make(plant, load_reference(robot))
 
 
 def _then_lqr(make: Make, fraction: float = 1.0) -> Make:
-    return lambda plant, robot: with_lqr(make(plant, robot), plant, robot, fraction=fraction)
+    return lambda plant, robot, policy: with_lqr(
+        make(plant, robot, policy), plant, robot, fraction=fraction
+    )
 
 
 def _guarded(make: Make) -> Make:
-    return lambda plant, robot: guard(make(plant, robot), robot, plant)
+    return lambda plant, robot, policy: guard(make(plant, robot, policy), robot, plant)
 
 
 CATALOGUE: dict[str, Entry] = {
-    "policy": Entry("Policy", lambda plant, robot: load_policy(robot)),
+    "policy": Entry("Policy", lambda plant, robot, policy: load_policy(policy)),
     "policy_network": Entry("Policy, network alone", _network),
     "policy_lqr": Entry("Policy, network + LQR", _then_lqr(_network)),
     "tvlqr": Entry("TVLQR", _along(tvlqr)),
     "tvlqr_guarded": Entry("TVLQR, guarded", _guarded(_along(tvlqr))),
     "mpc": Entry("iLQR MPC", _along(tracking_mpc)),
-    "mpc_free": Entry("iLQR MPC, free", free_mpc),
+    "mpc_free": Entry("iLQR MPC, free", _alone(free_mpc)),
     "riccati": Entry("iLQR Riccati gains", _along(riccati)),
     "open_loop_lqr": Entry("Open loop + LQR", _then_lqr(_open_loop)),
-    "energy_lqr": Entry("Energy shaping + LQR", _then_lqr(energy_shaping, fraction=2.0)),
+    "energy_lqr": Entry("Energy shaping + LQR", _then_lqr(_alone(energy_shaping), fraction=2.0)),
     "open_loop": Entry("Open loop", _open_loop),
-    "pd": Entry("PD", pd),
-    "lqr": Entry("LQR", lqr),
+    "pd": Entry("PD", _alone(pd)),
+    "lqr": Entry("LQR", _alone(lqr)),
 }
 
 
-def build(name: str, plant: Plant, robot: str) -> Controller:
+def build(name: str, plant: Plant, robot: str, policy: str | None = None) -> Controller:
     """The controller of that name, in the dtype of ``plant`` and of jax's default.
 
+    ``policy`` is the one that controllers are built around, by default that of the v2 boards.
     Raises ``JaxpendError`` for an unknown name; the message lists the known ones.
     """
-    return CATALOGUE[choose("controller", name, CATALOGUE)].make(plant, robot)
+    return CATALOGUE[choose("controller", name, CATALOGUE)].make(plant, robot, policy or robot)
 
 
 def find_controller(policy: str | Path | None, controller: str | None, task: Task) -> Controller:
@@ -104,13 +112,13 @@ def find_controller(policy: str | Path | None, controller: str | None, task: Tas
     """
     robot = task.robot
     if not controller:
-        return load_controller(policy or robot, robot=robot)
+        return load_controller(policy or task.shipped, robot=robot)
     if ":" in controller:
         own = _imported(controller)
         check_robot(own, robot)
         return load_controller(policy, robot=robot, classes=classes_of(own)) if policy else own
     if not policy:
-        return build(controller, task.plant, robot)
+        return build(controller, task.plant, robot, task.shipped)
     # What may be wrong comes first: some controllers take a while to build.
     given = network_in(load_policy(policy, robot=robot), policy)
     if not choose("controller", controller, CATALOGUE).startswith("policy"):

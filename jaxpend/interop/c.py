@@ -6,11 +6,12 @@ them (and sqrtf or logf for a controller of your own that has them). Compile it 
 of angles.
 
 How close it is, on the same measurements: in float64 a torque differs from that of jax by less
-than 1e-9 N m, whatever the controller. In float32 a policy, with a history or without, differs by
-some 1e-5 N m. An observer multiplies the rounding of an angle (2e-7 rad) by the rate of its calls,
-and with that a guarded policy differs by up to 3e-3 N m: as much as jax does in float32 from one
-compilation to the next. A loop that is closed in float32 drifts apart while it swings up, because
-the motion multiplies rounding too. ``experiments/export.py`` measures it.
+than 1e-9 N m, whatever the controller; in a "mixed" header, which takes and gives float but
+computes in double, by less than 1e-5 N m from jax in float64. In float32 a policy, with a history
+or without, differs by some 1e-5 N m. An observer multiplies the rounding of an angle (2e-7 rad) by
+the rate of its calls, and with that a guarded policy differs by up to 3e-3 N m: as much as jax does
+in float32 from one compilation to the next. A loop that is closed in float32 drifts apart while it
+swings up, because the motion multiplies rounding too. ``experiments/export.py`` measures it.
 """
 
 import re
@@ -125,6 +126,19 @@ static inline void {p}_step({p}_state *s, float t, const float x[4], float torqu
 
 #endif
 """
+MIXED = """
+/* Computed in double, since an observer multiplies the rounding of float. */
+static inline void {p}_step({p}_state *s, float t, const float x[4], float torque[2])
+{{
+    const double wide[4] = {{x[0], x[1], x[2], x[3]}};
+    double both[2];
+    {p}_double(s, t, wide, both);
+    torque[0] = (float)both[0];
+    torque[1] = (float)both[1];
+}}
+
+#endif
+"""
 LOOP = "for (int i = 0; i < {}; ++i) "
 
 
@@ -143,7 +157,8 @@ def source(
     Args:
         controller: any that can be traced.
         prefix: of the names, an identifier.
-        precision: "float32", or "float64" for a header that computes in double.
+        precision: "float32"; "float64" for a header that computes in double; "mixed" for one that
+            does so, but takes and gives float.
 
     Raises:
         JaxpendError: as ``trace.trace``, an unknown precision, or a prefix that is no identifier
@@ -151,8 +166,12 @@ def source(
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", prefix):
         raise JaxpendError(f"the prefix {prefix!r} is no name in C; use letters, digits and _")
-    text = _printed(trace(controller, precision), prefix)
-    return text if precision == "float32" else _in_double(text)
+    if precision != "mixed":
+        text = _printed(trace(controller, precision), prefix)
+        return text if precision == "float32" else _in_double(text)
+    text = _in_double(_printed(trace(controller, "float64"), prefix))
+    text = text.replace(f"{prefix}_step({prefix}_state", f"{prefix}_double({prefix}_state")
+    return text.replace("\n#endif\n", MIXED.format(p=prefix))
 
 
 def _in_double(text: str) -> str:

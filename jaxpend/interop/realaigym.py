@@ -19,6 +19,7 @@ import jax
 from ..boards import HEADINGS, Board, v2
 from ..controller import Controller, check_robot
 from ..controllers.files import load_controller, read_header
+from ..criteria import V2_OFFICIAL
 from ..errors import JaxpendError
 from ..files import write_atomically
 from ..leaderboard import judge
@@ -170,9 +171,10 @@ def submission(
 
 def _scores(found: Mapping[str, Any]) -> str:
     """The columns of both boards, as the readme shows them."""
-    headings = [f"{heading} [{unit}]" for heading, unit, *_ in HEADINGS.values()]
+    shown = {name: HEADINGS[name] for name in V2_OFFICIAL}
+    headings = [f"{heading} [{unit}]" for heading, unit, *_ in shown.values()]
     criteria = found["criteria"]
-    cells = [f"{criteria[name]:{form}}" for name, (_, _, form, _) in HEADINGS.items()]
+    cells = [f"{criteria[name]:{form}}" for name, (_, _, form, _) in shown.items()]
     success = "yes" if found["success"] else "no"
     lines = _table(["success", *headings, "score"], [success, *cells, f"{found['score']:.3f}"])
     if found.get("robustness") is not None:

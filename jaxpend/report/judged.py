@@ -15,7 +15,7 @@ from ..plant import forward_kinematics
 from ..robots import ROBOTS
 from ..robustness import benchmark
 from ..runs.reader import RunRecord
-from ..score import nominal_run
+from ..score import official, official_run
 
 __all__ = ["Judged", "criteria_costs", "judge"]
 
@@ -83,18 +83,19 @@ def judge(
     policy = None if controller and run.policy in ROBOTS else run.policy
     found = partial(find_controller, policy, controller, task)
     with jax.enable_x64(True):
-        trajectory, c = nominal_run(found(), task)
-        score = float(task.score(c))
+        trajectory, said = official_run(found(), board)
         points = jax.vmap(forward_kinematics, (None, 0))(task.plant, trajectory.x)
-    if robustness:
+    if board.seeds > 1:
+        said = official(found(), board)
+    if robustness and board.trials is not None:
         report = {"robot": run.robot} | benchmark(found(), board, jax.random.key(0)).as_dict()
     x = np.asarray(trajectory.x)
     samples = np.isfinite(x).all(axis=1).cumprod().sum()  # the first one is the start
     return Judged(
         task=task,
-        score=score,
-        criteria={name: float(value) for name, value in vars(c).items() if name != "success"},
-        success=bool(c.success),
+        score=said["score"],
+        criteria=said["criteria"],
+        success=said["success"],
         t=np.asarray(trajectory.t)[:samples],
         x=x[:samples],
         u=np.asarray(trajectory.u)[: samples - 1],

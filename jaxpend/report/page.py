@@ -126,12 +126,14 @@ def _seconds(run: RunRecord) -> float:
 
 
 def _board(run: RunRecord) -> Board:
-    """The v2 board of a run's robot; of a run on a plant of its own, on that, and unpublished."""
-    official, plant = boards.v2(run.robot), run.made_by.get("plant")
+    """The board of a run; of a run on a plant of its own, on that, and unpublished."""
+    plant, name = run.made_by.get("plant"), run.config.get("board") or "v2"
+    official = boards.named_board(run.robot, name)
     if not plant or plant == dict(official.task.parameters):
         return official
     name = run.config.get("plant") or run.config.get("design") or "a plant of its own"
-    return Board(f"{official.name} on {name}", official.task.of(plant))
+    name, task = f"{official.name} on {name}", official.task.of(plant)
+    return dataclasses.replace(official, name=name, task=task, published=())
 
 
 def _legible(text: str) -> str:

@@ -139,9 +139,9 @@ class SAC(Stage[SACState | None, SACState, Controller]):
     def judge(self, state: SACState, metrics: Row) -> tuple[Row, Candidates]:
         policy = algorithm.greedy_policy(self.agent, state)
         c = nominal(policy, self.task)
-        score = float(self.task.score(c))
+        score = float(self.task.score(c).mean())
         worth = value(self.agent.config.objective, policy, score, self.task)
-        row = {"updates": int(state.updates), "score": score, "uptime": c.uptime, **metrics}
+        row = {"updates": int(state.updates), "score": score, "uptime": c.uptime.mean(), **metrics}
         return row | {"value": worth}, [(policy, worth)]
 
     def note(self, row: Row) -> str:

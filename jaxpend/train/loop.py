@@ -1,6 +1,7 @@
 """The whole job: SAC on the surrogate reward, then the gradient and SNES on the official score."""
 
 import contextlib
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..boards import Board, Task, task_of
+from ..boards import Task, named_board, task_of
 from ..config import GradientRun, Run, SNESRun
 from ..controller import Controller
 from ..controllers.catalogue import find_controller
@@ -109,10 +110,11 @@ def train(
         JaxpendError: the folder cannot be used or written, or training diverged.
         Stopped: a signal asked for it, and everything is on disk.
     """
-    task, start = task_of(config.robot, config.plant, config.design), None
+    task, start = task_of(config.robot, config.plant, config.design, config.board), None
     if isinstance(config, GradientRun | SNESRun):
         # Before the folder is made: a wrong file leaves nothing behind.
         start = find_controller(config.policy, config.controller, task)
+    board = dataclasses.replace(named_board(config.robot, config.board), task=task)
     stages = stages_of(config, start, task, kinds)
     about = {"plant": dict(task.parameters), "stages": [s.about() for s in stages.values()]}
     vmap = config.vmap == "yes" or (config.vmap == "auto" and jax.default_backend() != "cpu")
@@ -124,7 +126,7 @@ def train(
     with contextlib.ExitStack() as opened:
         for one in seeds:
             folder = opened.enter_context(RunFolder(one.folder, one, command, about))
-            runs.append(SeedRun(one, folder, Board("v2", task), start))
+            runs.append(SeedRun(one, folder, board, start))
         for run in runs:
             if (result := run.folder.result) is None:
                 waiting.append(run)
