@@ -13,12 +13,12 @@ STAMP := $(VENV)/.installed
 ifeq ($(filter $(ROBOT),acrobot pendubot),)
 $(error ROBOT is '$(ROBOT)'; it must be acrobot or pendubot)
 endif
-ifeq ($(filter $(TASK),v2 global),)
-$(error TASK is '$(TASK)'; it must be v2 or global)
+ifeq ($(filter $(TASK),v2 global hardware),)
+$(error TASK is '$(TASK)'; it must be v2, global or hardware)
 endif
 
 # What `make train` reads: a recipe that ships with the package.
-CONFIG = $(if $(filter global,$(TASK)),global_$(ROBOT),$(CONFIG_OF_RECIPE))
+CONFIG = $(if $(filter v2,$(TASK)),$(CONFIG_OF_RECIPE),$(TASK)_$(ROBOT))
 CONFIG_OF_RECIPE = $(or $(CONFIG_$(RECIPE)),$(error RECIPE is '$(RECIPE)'; it must be demonstrated, learned or plain))
 CONFIG_demonstrated := $(ROBOT)
 CONFIG_learned := learned_$(ROBOT)
@@ -30,7 +30,7 @@ CONFIG_plain := plain
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 	@echo
-	@echo "variables: ROBOT=acrobot|pendubot  TASK=v2|global  RECIPE=demonstrated|learned|plain  SEED=0  RUN=name  ARGS='--sac.steps 100000'"
+	@echo "variables: ROBOT=acrobot|pendubot  TASK=v2|global|hardware  RECIPE=demonstrated|learned|plain  SEED=0  RUN=name  ARGS='--sac.steps 100000'"
 	@echo "the command behind them, with its own --help: $(BIN)/jaxpend"
 
 $(STAMP): pyproject.toml .constraints.txt
@@ -42,7 +42,7 @@ $(STAMP): pyproject.toml .constraints.txt
 
 install: $(STAMP)  ## make .venv with pinned versions
 
-train: $(STAMP)  ## train for TASK=v2|global, v2 by RECIPE=...; ends with the official score
+train: $(STAMP)  ## train for TASK=v2|global|hardware, v2 by RECIPE=...; ends with the official score
 	$(BIN)/jaxpend train --config $(CONFIG) --robot $(ROBOT) --seed $(SEED) --run $(RUN) $(ARGS)
 
 snes: $(STAMP)  ## fine-tune by SNES: ARGS='--policy FILE' or '--controller NAME'

@@ -10,13 +10,24 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from . import designs
 from .controller import robot_of
-from .criteria import HEIGHT, V2_HARDWARE, V2_OFFICIAL, Criteria, ScoreV2, ScoreV3, criteria
+from .criteria import (
+    HEIGHT,
+    V2_HARDWARE,
+    V2_OFFICIAL,
+    Criteria,
+    ScoreV2,
+    ScoreV3,
+    criteria,
+    upright,
+)
 from .errors import JaxpendError, choose
-from .plant import Plant
+from .hardware import PRESETS, Spread, draw
+from .plant import Plant, tip_height
 from .resets import HOLD, JITTER, Resets, official_resets, random_resets
 from .robots import ROBOTS, active_joint
 from .rollout import Trajectory
@@ -24,8 +35,8 @@ from .scenario import DT, Scenario
 from .variations import RANGES, sample
 
 __all__ = [
-    "BOARDS", "CRITERIA", "HEADINGS", "V2", "V3", "Board", "Strip", "Task", "board", "hardware",
-    "named_board", "own_task", "strips", "task_of", "v2", "v3",
+    "BOARDS", "CRITERIA", "HARDWARE", "HEADINGS", "V2", "V3", "Board", "Strip", "Task", "board",
+    "hardware", "named_board", "own_task", "strips", "task_of", "v2", "v3",
 ]  # fmt: skip
 
 
@@ -46,6 +57,8 @@ class Task:
     duration: float = 10.0  # s
     height: float = HEIGHT  # the line, as a fraction of the stretched height
     scoring: Callable[[Criteria], jax.Array] = ScoreV2()  # hashable
+    robots: Spread | None = None  # how real ones differ; None: one imperfection at a time
+    standing: float = 0.0  # s, at the end, for which it has to stand; 0: in its last state
     resets: int = 0  # times in a run that somebody throws the arm, see ``jaxpend.resets``
 
     def __post_init__(self) -> None:
@@ -81,7 +94,8 @@ class Task:
     @property
     def shipped(self) -> str:
         """Name of the policy that ships for it."""
-        return f"global_{self.robot}" if self.resets else self.robot
+        kind = "hardware_" if self.robots else "global_" if self.resets else ""
+        return f"{kind}{self.robot}"
 
     @property
     def trials(self) -> int:
@@ -93,8 +107,33 @@ class Task:
         return self._thrown(Scenario(self.plant), key)
 
     def sample(self, key: jax.Array, share: float = 1.0) -> Scenario:
-        """The same with a random imperfection, see ``variations.sample``; ``key`` is consumed."""
-        return self._thrown(sample(self.plant, key, share), key)
+        """The same with random imperfections in a ``share`` of them; ``key`` is consumed."""
+        return self._thrown(self.imperfect(self.plant, key, share), key)
+
+    def imperfect(self, plant: Plant, key: jax.Array, share: float = 1.0) -> Scenario:
+        """Random imperfections around a nominal plant; ``key`` is consumed.
+
+        Of a task with ``robots`` it is one of those, and a ``share`` of them is pushed; else it
+        has one imperfection of the robustness benchmark's six kinds (``variations.sample``).
+        """
+        if self.robots is None:
+            return sample(plant, key, share)
+        key_robot, key_pushed = jax.random.split(key)
+        pushed = jax.random.bernoulli(key_pushed, share)
+        return draw(self.robots, plant, key_robot, pushed=pushed, duration=self.duration)
+
+    def stands(self, x: jax.Array, length: jax.Array | None = None) -> jax.Array:
+        """Whether a run, states (..., N, 4), ends well: () bool of each.
+
+        Its last state is upright (``criteria.upright``), or, of a task with ``standing``, the tip
+        is above the line in all of the last so many s, which a spinning arm's is not; ``length``
+        (2,), m, is that of the links, by default the nominal one.
+        """
+        if not self.standing:
+            return upright(x[..., -1, :])
+        last = x[..., -round(self.standing / self.dt) :, :]
+        length = self.plant.length if length is None else length
+        return jnp.all(tip_height(length, last) > self.height * jnp.sum(length), axis=-1)
 
     def _thrown(self, scenario: Scenario, key: jax.Array) -> Scenario:
         if not self.resets:
@@ -255,7 +294,22 @@ V3 = {
     )
     for robot in ROBOTS
 }
-BOARDS = {"v2": V2, "v3": V3}
+# The real robots, of design C.1 with friction and motor inertia.
+HARDWARE = {
+    robot: Board(
+        "hardware",
+        Task(
+            robot,
+            tuple((name, v) for name, v in designs.parameters("C.1/1.0").items()),
+            scoring=ScoreV2(tuple(V2_HARDWARE.items())),
+            robots=PRESETS["identified"],
+            standing=2.0,
+        ),
+        trials=None,
+    )
+    for robot in ROBOTS
+}
+BOARDS = {"v2": V2, "v3": V3, "hardware": HARDWARE}
 
 
 def v2(robot: str) -> Board:

@@ -76,8 +76,6 @@ class Reward(Checked):
     phi1: NotNegative = 0.15  # change of the action, above the line
     phi2: NotNegative = 0.15  # change of the action, below
     eta: NotNegative = 0.02  # s^2, joint velocities squared, below
-    # Whole turns that the joints are off, above the line: a hand that resets the arm undoes them.
-    turns: NotNegative = 0.0
     # A step earns at least this; a spinning arm earns -100 and less.
     floor: Annotated[float, Bounds(most=0, infinite=True)] = -math.inf
 
@@ -230,7 +228,7 @@ class SNESConfig(Checked):
     """Hyperparameters of the evolution strategy."""
 
     strategy: Strategy = "snes"
-    generations: Count = 400
+    generations: Natural = 400  # 0: ``train`` leaves the stage out
     population: Annotated[int, Bounds(least=2)] = 40
     sigma: Positive = 0.01  # initial standard deviation of a network's weights
     gain_sigma: Positive = 0.05  # of the logarithm of all else: a fraction
@@ -266,9 +264,6 @@ class GradientConfig(Checked):
     gain_learning_rate: Positive = 1e-3  # of the logarithm of all else: a fraction
     final_learning_rate: Positive = 0.01  # cosine decay to this fraction of learning_rate
     duration: Duration = 3.0  # s of the nominal run; afterwards a good policy stands still
-    starts: Count = (
-        1  # runs a step, from where resets by hand leave the arm; 1 where there are none
-    )
     clip: Positive = 0.1  # norm of the gradient of one run
     searched: str = "all"  # as in SNESConfig
     line_width: Positive = 0.005  # m, over which the line is blurred
@@ -365,11 +360,18 @@ class SNESRun(Run):
 
 @dataclasses.dataclass(frozen=True)
 class TrainRun(SACRun):
-    """SAC, then from its best policy the gradient, where it has steps, then SNES, guarded."""
+    """SAC, then from its best policy the gradient and SNES, guarded, where they have steps."""
 
     gradient: GradientConfig = dataclasses.field(default_factory=lambda: GradientConfig(steps=0))
     guard: GuardConfig = dataclasses.field(default_factory=GuardConfig)
     snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.snes.generations and (self.guard.observe or self.guard.rescue):
+            raise JaxpendError(
+                "snes.generations is 0; a guard needs some, since SNES begins with it"
+            )
 
 
 @dataclasses.dataclass(frozen=True)

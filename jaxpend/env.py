@@ -21,9 +21,8 @@ from .config import LINES, EnvConfig, Reward
 from .plant import Plant, forward_kinematics, kinetic_energy, potential_energy, rk4_step
 from .pytree import Pytree, pytree
 from .resets import thrown
-from .rollout import actuate, draws, measure
+from .rollout import SLOTS, Sensors, actuate, draws, measure, sensors
 from .scenario import DT, Scenario
-from .variations import LONGEST_DELAY, sample
 
 __all__ = [
     "Env",
@@ -48,8 +47,7 @@ def surrogate_reward(plant: Plant, reward: Reward, line: float, x, action, befor
     With end-effector height y, potential and kinetic energy V and T, and action change da:
     ``V + alpha (1 + cos theta2)^2 - beta T - rho1 a^2 - phi1 |da|`` where y is above the line,
     ``V - rho2 a^2 - phi2 |da| - eta (omega1^2 + omega2^2)`` below it, at least ``floor``. The
-    ``line`` is a height in m; that of the coefficients may be None. Ours is a charge of ``turns``
-    above the line for every whole turn that the joints are off, see ``whole_turns``.
+    ``line`` is a height in m; that of the coefficients may be None.
     """
     height = forward_kinematics(plant, x)[1, 1]
     potential, kinetic = potential_energy(plant, x), kinetic_energy(plant, x)
@@ -57,17 +55,9 @@ def surrogate_reward(plant: Plant, reward: Reward, line: float, x, action, befor
     straight = (1 + jnp.cos(x[1])) ** 2
     above = reward.alpha * straight - reward.beta * kinetic
     above = above - reward.rho1 * effort - reward.phi1 * change
-    if reward.turns:
-        above = above - reward.turns * jnp.sum(jnp.abs(whole_turns(x)))
     below = -reward.rho2 * effort - reward.phi2 * change - reward.eta * (x[2] ** 2 + x[3] ** 2)
     total = potential + jnp.where(height > line, above, below)
     return jnp.maximum(total, reward.floor)
-
-
-def whole_turns(x: jax.Array) -> jax.Array:
-    """Whole turns (2,) by which an arm (4,) that stands is off; upright at -pi is none, too."""
-    shoulder = jnp.sign(x[0]) * jnp.maximum(jnp.abs(x[0]) - jnp.pi, 0.0)
-    return jnp.round(jnp.stack([shoulder, x[1]]) / (2 * jnp.pi))
 
 
 @pytree
@@ -75,7 +65,7 @@ class World(Pytree):
     """The random scenario of an episode, and what a rollout in it carries from step to step."""
 
     scenario: Scenario
-    states: jax.Array  # (LONGEST_DELAY + 1, 4) true states, a ring buffer
+    sensors: Sensors
     measured: jax.Array  # (4,)
     applied: jax.Array  # (2,) N m
     k: jax.Array  # () int, steps of ``scenario.DT``
@@ -134,8 +124,6 @@ class Env:
     def observe(self, x, action, past, world, reward) -> EnvState:
         """A state with what is seen in it; the arguments are as in ``EnvState``."""
         view, privileged = self.config.observation, action[None]
-        if self.config.reward.turns:
-            privileged = jnp.append(whole_turns(x), privileged)
         if world is not None:
             privileged = jnp.concatenate([view.of_state(x), privileged])
         obs = view(x if world is None else world.measured, past)
@@ -152,11 +140,11 @@ class Env:
             past = jnp.tile(jnp.append(x, zero), (self.config.observation.history, 1))
         if self.config.randomised:
             key_scenario, key_start, key = jax.random.split(key, 3)
-            scenario = sample(self.plant, key_scenario, self.config.randomised)
-            states, k = jnp.zeros((LONGEST_DELAY + 1, 4)), jnp.zeros((), jnp.int32)
+            scenario = self.task.imperfect(self.plant, key_scenario, self.config.randomised)
+            before, k = sensors(scenario, x, SLOTS), jnp.zeros((), jnp.int32)
             z = jax.tree.map(lambda z: z[0], draws(scenario, key_start, None, 1, x.dtype))
-            states, measured = measure(scenario, states, k, x, z)
-            world = World(scenario, states, measured, jnp.zeros(2), k, key)
+            after, measured = measure(scenario, before, k, x, z)
+            world = World(scenario, after, measured, jnp.zeros(2), k, key)
         return self.observe(x, zero, past, world, zero)
 
     def _start(self, key: jax.Array) -> jax.Array:
@@ -213,8 +201,8 @@ class Env:
             x, now = carry
             applied, k = actuate(scenario, torque, now.applied, now.k * dt, z), now.k + 1
             x = rk4_step(scenario.plant, x, applied, dt)
-            states, measured = measure(scenario, now.states, k, x, z)
-            return (x, World(scenario, states, measured, applied, k, key)), None
+            after, measured = measure(scenario, now.sensors, k, x, z)
+            return (x, World(scenario, after, measured, applied, k, key)), None
 
         noise = draws(scenario, key_noise, None, steps, x.dtype)
         return jax.lax.scan(step, (x, world.replace(key=key)), noise)[0]
@@ -224,8 +212,7 @@ class Env:
         """The factors, 1 or -1, that mirror ``obs`` (obs_size,) and ``privileged``."""
         view = self.config.observation
         true = dataclasses.replace(view, history=0).mirrored if self.config.randomised else ()
-        turns = (-1, -1) if self.config.reward.turns else ()
-        return view.mirrored, (*true, *turns, -1)
+        return view.mirrored, (*true, -1)
 
 
 def truncated(config: EnvConfig, state: EnvState, steps: jax.Array) -> jax.Array:

@@ -26,12 +26,14 @@ __all__ = [
     "LARGEST",
     "OFF",
     "ON",
+    "BoardName",
     "Bounds",
     "Checked",
     "Count",
     "Natural",
     "NotNegative",
     "Positive",
+    "Preset",
     "Robot",
     "Scale",
     "Seed",
@@ -82,7 +84,8 @@ Share = Annotated[float, Bounds(least=0, most=1)]
 # Keys of jax are made of 32 bits; the largest seed is for scenarios that no run trains on.
 Seed = Annotated[int, Bounds(least=0, below=LARGEST)]
 Robot = Literal["acrobot", "pendubot"]
-BoardName = Literal["v2", "v3"]
+Preset = Literal["identified", "wide", "authors"]  # of ``hardware.PRESETS``
+BoardName = Literal["v2", "v3", "hardware"]
 
 
 class Checked:

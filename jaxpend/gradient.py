@@ -37,14 +37,12 @@ from .controllers.policy import Policy
 from .controllers.search_space import coordinates
 from .criteria import EPSILON, upright
 from .errors import JaxpendError
-from .plant import rk4_step, tip_height
+from .plant import rk4_step
 from .pytree import Pytree, pytree
-from .resets import thrown
 from .rollout import rollout
 from .scenario import Scenario
 from .stage import Candidates, Chart, Row, SearchStage, SearchState, Stage
 from .trajopt.swingup import SwingUp, smooth_score, totals
-from .variations import LONGEST_DELAY
 
 __all__ = [
     "Gradient", "GradientConfig", "GradientState", "Retained", "current", "improve", "init",
@@ -97,22 +95,6 @@ def performance(config: GradientConfig, controller: Controller, task: Task) -> j
     return smooth_score(p, totals(p, run.x, run.u[:, task.joint]))
 
 
-def time_up(
-    config: GradientConfig, controller: Controller, task: Task, key: jax.Array
-) -> jax.Array:
-    """Smooth share of ``config.duration`` s that the tip is above the line, after a reset by hand.
-
-    ``key`` is consumed: it draws the state in which the reset leaves an arm that stood.
-    """
-    key_start, key_run = jax.random.split(key)
-    plant, both = task.plant, task.with_resets(Scenario(task.plant), None).plant
-    x0 = jax.lax.stop_gradient(thrown(both, key_start, task.dt))
-    options = {"duration": config.duration, "integrator": _fading(config.memory)}
-    run = rollout(Scenario(plant, x0=x0), controller, key_run, dt=task.dt, **options)
-    line = task.height * jnp.sum(plant.length)
-    return jax.nn.sigmoid((tip_height(plant.length, run.x) - line) / config.line_width).mean()
-
-
 def uprightness(x: jax.Array) -> jax.Array:
     """``1 / (1 + d^2)`` of states (..., 4), d the distance to upright in units of ``EPSILON``."""
     off = jnp.stack([2 * (1 + jnp.cos(x[..., 0])), 2 * (1 - jnp.cos(x[..., 1]))], axis=-1)
@@ -124,9 +106,8 @@ def robustness(
     config: GradientConfig, controller: Controller, scenario: Scenario, key: jax.Array, task: Task
 ) -> jax.Array:
     """Mean uprightness of a run of ``config.scenario_duration`` s; ``key`` is consumed."""
-    slots, integrator = LONGEST_DELAY + 1, _fading(config.memory)
-    options = {"duration": config.scenario_duration, "integrator": integrator}
-    run = rollout(scenario, controller, key, dt=task.dt, delay_slots=slots, **options)
+    options = {"duration": config.scenario_duration, "integrator": _fading(config.memory)}
+    run = rollout(scenario, controller, key, dt=task.dt, **options)
     return uprightness(run.x).mean()
 
 
@@ -146,7 +127,7 @@ def retained(config: GradientConfig, policy: Policy, task: Task) -> Retained:
 
     def one(scenario, key):
         options: dict[str, Any] = {"dt": task.dt, "duration": task.duration}
-        run = rollout(scenario, policy, key, delay_slots=LONGEST_DELAY + 1, **options)
+        run = rollout(scenario, policy, key, **options)
 
         def step(carry, now):
             obs = policy.look(carry, *now)
@@ -182,19 +163,9 @@ def slope(config: GradientConfig, start: Controller, task: Task, z: jax.Array, k
     ``start`` is the origin of the coordinates; ``key`` is consumed.
     """
     rebuild = coordinates(start, config.searched)[-1]
-    if task.resets:
-        key, key_starts = jax.random.split(key)
-        of_one = jax.value_and_grad(lambda z, key: time_up(config, rebuild(z), task, key))
-        found = jax.vmap(of_one, (None, 0))(z, jax.random.split(key_starts, config.starts))
-        values, ascents, finite = jax.vmap(partial(_usable, config))(*found)
-        kept = jnp.maximum(finite.sum(), 1)
-        value, ascent = values.sum() / kept, ascents.sum(axis=0) / kept
-        lost = jnp.sum(~finite, dtype=jnp.int32)
-    else:
-        found = jax.value_and_grad(lambda z: performance(config, rebuild(z), task))(z)
-        value, ascent, finite = _usable(config, *found)
-        lost = 1 - finite.astype(jnp.int32)
-    metrics = {"smooth_score": value}
+    found = jax.value_and_grad(lambda z: performance(config, rebuild(z), task))(z)
+    value, ascent, finite = _usable(config, *found)
+    lost, metrics = 1 - finite.astype(jnp.int32), {"smooth_score": value}
     if not config.scenarios:
         return ascent, lost, metrics
     keys = jax.random.split(key, 2 * config.scenarios)
@@ -307,7 +278,7 @@ class Gradient(SearchStage):
     name, title, unit, column = "gradient", "Gradient", "steps", "step"
     heading, scores = "after the gradient", ("score",)
     charts = (
-        Chart("Official score", {"best so far": "best", "now": "score"}, "v2 score"),
+        Chart("Official score", {"best so far": "best", "now": "score"}, "score"),
         Chart("Smooth score", {"smooth score": "smooth_score"}, "of the nominal run"),
         Chart("Norm of the gradient", {"norm": "slope"}, log=True),
     )

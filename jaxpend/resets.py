@@ -18,8 +18,8 @@ from .plant import Plant, gravity_vector, rk4_step
 from .pytree import Pytree, pytree
 
 __all__ = [
-    "Hand", "Resets", "begun", "held", "official_resets", "push", "random_resets", "stamps",
-    "thrown",
+    "HOLD", "JITTER", "Hand", "Resets", "begun", "held", "official_resets", "push",
+    "random_resets", "stamps", "thrown",
 ]  # fmt: skip
 
 HOLD = 0.2  # s, that a reset lasts, and up to one step more

@@ -16,8 +16,12 @@ from .pytree import Pytree, pytree
 from .resets import begun, push
 from .scenario import DT, DURATION, Scenario
 
-__all__ = ["Trajectory", "actuate", "draws", "final_state", "measure", "rollout", "time_stamps"]
+__all__ = [
+    "SLOTS", "Sensors", "Trajectory", "actuate", "draws", "final_state", "measure", "rollout",
+    "sensors", "time_stamps",
+]  # fmt: skip
 
+SLOTS = 32  # past states kept for delayed measurements, by default
 # Columns of the standard normals of one step, in the order of the reference simulator.
 NOISE = {"measurement_noise": (0, 4), "torque_noise": (4, 6), "process_noise": (6, 10)}
 
@@ -58,17 +62,44 @@ def draws(scenario: Scenario, key, normals, steps: int, dtype) -> dict[str, jax.
     return {name: jax.random.normal(keys[name], (steps, columns[name]), dtype) for name in noisy}
 
 
-def measure(scenario: Scenario, history, k, x, z):
-    """Delayed and noisy measurement; returns it with the updated ring buffer of past states."""
-    measured = x
-    if scenario.delay is not None:
-        slots = history.shape[0]
-        history = jax.lax.dynamic_update_slice_in_dim(history, x[None], k % slots, 0)
+@pytree
+class Sensors(Pytree):
+    """What the sensors of a scenario remember."""
+
+    states: jax.Array | None  # (slots, 4) true ones, a ring buffer, where there is a delay
+    encoded: jax.Array | None  # (4,) the last angles and velocities of an encoder
+
+
+def sensors(scenario: Scenario, x0: jax.Array, slots: int) -> Sensors:
+    """They before a run from ``x0`` (4,), with room for ``slots`` delayed states."""
+    states = None if scenario.delay is None else jnp.broadcast_to(x0, (slots, 4))
+    return Sensors(states, None if scenario.encoder is None else x0)
+
+
+def measure(scenario: Scenario, sensors: Sensors, k, x, z):
+    """Delayed and noisy measurement, as an encoder gives it; with the sensors after it.
+
+    The noise of angles is in front of the encoder, that of velocities behind its filter.
+    """
+    states, seen = sensors.states, x
+    if states is not None:
+        slots = states.shape[0]
+        states = jax.lax.dynamic_update_slice_in_dim(states, x[None], k % slots, 0)
         lagged = jnp.maximum(k - scenario.delay, 0) % slots
-        measured = jnp.take_along_axis(history, lagged[None], axis=0)[0]
+        seen = jnp.take_along_axis(states, lagged[None], axis=0)[0]
+    noise = jnp.zeros(4)
     if scenario.measurement_noise is not None:
-        measured = measured + scenario.measurement_noise * z["measurement_noise"]
-    return history, measured
+        noise = scenario.measurement_noise * z["measurement_noise"]
+        seen = seen + noise
+    if (encoder := scenario.encoder) is None:
+        return Sensors(states, None), seen
+    assert sensors.encoded is not None
+    before, angles = sensors.encoded, encoder.step * jnp.round(seen[:2] / encoder.step)
+    rate = jnp.where(k == 0, before[2:], (angles - before[:2]) / encoder.dt)
+    encoded = jnp.concatenate([angles, before[2:] + encoder.weight * (rate - before[2:])])
+    noisy = scenario.measurement_noise is not None
+    seen = encoded.at[2:].add(noise[2:]) if noisy else encoded
+    return Sensors(states, encoded), seen
 
 
 def actuate(scenario: Scenario, command, applied_before, t_pulse, z):
@@ -102,8 +133,8 @@ def _closed_loop(
     }
 
     def step(carry, now):
-        x, u, memory, hand, history = carry
-        history, measured = measure(scenario, history, now["k"], x, now["z"])
+        x, u, memory, hand, sensed = carry
+        sensed, measured = measure(scenario, sensed, now["k"], x, now["z"])
         after, command = controller(memory, now["t"], measured)
         command = jnp.asarray(command, dtype)
         if command.shape != (2,):
@@ -117,12 +148,12 @@ def _closed_loop(
         x_next = integrator(plant, x, u, dt)
         if scenario.process_noise is not None:
             x_next = x_next + scenario.process_noise * now["z"]["process_noise"]
-        carry = x_next, u, after, hand, history
+        carry = x_next, u, after, hand, sensed
         return carry, (x, u, measured, command) if record else None
 
-    history = None if scenario.delay is None else jnp.broadcast_to(x0, (delay_slots, 4))
+    sensed = sensors(scenario, x0, delay_slots)
     hand = None if scenario.resets is None else begun(dtype)
-    start = (x0, jnp.zeros(2, dtype), controller.reset(controller_key), hand, history)
+    start = (x0, jnp.zeros(2, dtype), controller.reset(controller_key), hand, sensed)
     (x_end, *_), recorded = jax.lax.scan(step, start, inputs)
     if not record:
         return x_end
@@ -155,7 +186,7 @@ def rollout(
     dt: float = DT,
     duration: float = DURATION,
     integrator: Callable = rk4_step,
-    delay_slots: int = 32,
+    delay_slots: int = SLOTS,
     normals: jax.Array | None = None,
 ) -> Trajectory:
     """Run a controller on a scenario; the order of a step is that of the reference simulator.
@@ -196,7 +227,7 @@ def final_state(
     dt: float = DT,
     duration: float = DURATION,
     integrator: Callable = rk4_step,
-    delay_slots: int = 32,
+    delay_slots: int = SLOTS,
 ) -> jax.Array:
     """Only the last true state of ``rollout``, shape (4,): no trajectory is kept in memory."""
     scenario = _check(scenario, controller, delay_slots)

@@ -17,7 +17,7 @@ from .pytree import Pytree, pytree
 from .resets import Resets
 
 __all__ = [
-    "DT", "DURATION", "NEUTRAL", "Pulses", "Scenario", "check_values", "delay_steps",
+    "DT", "DURATION", "NEUTRAL", "Encoder", "Pulses", "Scenario", "check_values", "delay_steps",
     "random_pulses", "with_neutral",
 ]  # fmt: skip
 
@@ -41,6 +41,15 @@ class Pulses(Pytree):
 
 
 @pytree
+class Encoder(Pytree):
+    """Angles in steps, and velocities as their differences, through a filter of first order."""
+
+    step: jax.Array  # (2,) rad
+    weight: jax.Array  # () of the newest difference, in (0, 1]
+    dt: jax.Array  # () s, from one measurement to the next
+
+
+@pytree
 class Scenario(Pytree):
     """What a controller is put into. Only ``plant`` is required; the rest defaults to nominal."""
 
@@ -52,6 +61,7 @@ class Scenario(Pytree):
     torque_noise: jax.Array | None = None  # (2,) N m, standard deviation
     responsiveness: jax.Array | None = None  # () fraction of the commanded change made per step
     pulses: Pulses | None = None
+    encoder: Encoder | None = None  # what measures the angles; None: angles and velocities are
     resets: Resets | None = None  # by hand, in which the controller is not called
 
     @property

@@ -25,14 +25,12 @@ from .criteria import (
     score_v1,
     score_v2,
     score_v3,
-    upright,
 )
 from .errors import JaxpendError
 from .plant import Plant
 from .resets import held
 from .rollout import Trajectory, rollout
 from .scenario import Scenario
-from .variations import LONGEST_DELAY
 
 __all__ = [
     "V1_DEFAULT", "V1_OFFICIAL", "V2_HARDWARE", "V2_OFFICIAL", "Criteria", "ScoreV2", "ScoreV3",
@@ -61,15 +59,15 @@ def imperfect(
 ) -> tuple[Criteria, jax.Array]:
     """Criteria (count,) of runs in random imperfect scenarios of a task, and which end upright.
 
-    Upright, (count,) bool, is meant as in the robustness benchmark. ``key`` is consumed.
+    Upright, (count,) bool, is meant as in ``Task.stands``. ``key`` is consumed.
     """
     key_scenarios, key_runs = jax.random.split(key)
     scenarios = jax.vmap(task.sample)(jax.random.split(key_scenarios, count))
 
     def one(scenario: Scenario, key: jax.Array) -> tuple[Criteria, jax.Array]:
         options: dict[str, Any] = {"dt": task.dt, "duration": task.duration}
-        run = rollout(scenario, controller, key, delay_slots=LONGEST_DELAY + 1, **options)
-        return task.criteria(run, scenario.plant), upright(run.x[-1])
+        run = rollout(scenario, controller, key, **options)
+        return task.criteria(run, scenario.plant), task.stands(run.x, scenario.plant.length)
 
     return jax.vmap(one)(scenarios, jax.random.split(key_runs, count))
 

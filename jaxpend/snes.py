@@ -20,11 +20,12 @@ from evosax import algorithms
 
 from . import config
 from .boards import Task, own_task
-from .config import GuardConfig, Run, SNESConfig
+from .config import GuardConfig, Run, SNESConfig, SNESRun
 from .controller import Controller, check_controller
 from .controllers.guard import guard
 from .controllers.policy import change_policies
 from .controllers.search_space import coordinates
+from .errors import JaxpendError
 from .pytree import Pytree, pytree
 from .score import combined, imperfect, performance
 from .stage import Candidates, Chart, Row, SearchStage, SearchState
@@ -181,8 +182,8 @@ class SNES(SearchStage):
     name, title, unit, column = "snes", "SNES", "generations", "generation"
     heading, scores = "after SNES", ("mean_score", "individual_score")
     charts = (
-        Chart("Fitness", {"mean": "mean_fitness", "best": "max_fitness"}, "noisy v2 score"),
-        Chart("Official score", {"best so far": "best", "mean": "mean_score"}, "v2 score"),
+        Chart("Fitness", {"mean": "mean_fitness", "best": "max_fitness"}, "noisy score"),
+        Chart("Official score", {"best so far": "best", "mean": "mean_score"}, "score"),
         Chart("Standard deviation", {"sigma": "sigma"}, "of the parameters"),
     )
 
@@ -199,7 +200,11 @@ class SNES(SearchStage):
     @classmethod
     def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
         config = getattr(run, "snes", None)
-        return cls(config, start, task, getattr(run, "guard", None)) if config else None
+        if config and not config.generations and isinstance(run, SNESRun):
+            raise JaxpendError("snes.generations is 0; a run of SNES alone needs some")
+        if not (config and config.generations):
+            return None
+        return cls(config, start, task, getattr(run, "guard", None))
 
     def prepared(self, controller: Controller) -> Controller:
         return guard(controller, self.task.robot, self.task.plant, **self.guarding)

@@ -289,10 +289,13 @@ def test_sections_of_other_commands_are_passed_over_only_where_said(tmp_path):
 
 
 def test_the_recipes_are_valid_for_every_training_command():
-    names = ["acrobot", "learned_acrobot", "learned_pendubot", "pendubot", "plain"]
-    assert recipes() == names
+    robots = ("acrobot", "pendubot")
+    kinds = ("global_", "hardware_", "learned_")
+    assert recipes() == sorted([*robots, "plain", *(k + r for k in kinds for r in robots)])
     for name, kind in itertools.product(recipes(), (SACRun, SNESRun, TrainRun)):
         run = load_config(kind(), name, SECTIONS)
-        assert run.robot == (name.removeprefix("learned_") if name != "plain" else "pendubot")
+        assert run.robot == (name.rpartition("_")[2] if name != "plain" else "pendubot")
+        board = {"global": "v3", "hardware": "hardware"}.get(name.partition("_")[0], "v2")
+        assert run.board == board
         if kind is not SACRun:
             assert run.snes == load_config(TrainRun(), name, SECTIONS).snes

@@ -12,11 +12,11 @@ from conftest import refused
 
 from jaxpend.boards import Task, v2, v3
 from jaxpend.cli.app import main
-from jaxpend.config import EnvConfig, Reward
+from jaxpend.config import EnvConfig
 from jaxpend.controller import Feedback, Zero
 from jaxpend.controllers.files import load_policy
 from jaxpend.controllers.policy import network_in
-from jaxpend.env import Env, _thrown_states, surrogate_reward, whole_turns
+from jaxpend.env import Env, _thrown_states
 from jaxpend.pytree import pytree
 from jaxpend.resets import Resets, held, official_resets, random_resets, stamps, thrown
 from jaxpend.rollout import rollout
@@ -226,31 +226,3 @@ def test_the_command_judges_a_draw_and_refuses_what_the_board_has_not(monkeypatc
         code, out, err = run(line)
         assert (code, out) == (2, ""), line
         assert words in err.replace("\n", " "), err
-
-
-def test_whole_turns_are_charged_above_the_line_and_shown_to_the_critics():
-    pi = np.pi
-    for x, turns in (
-        ([pi, 0], [0, 0]),
-        ([-pi, 0.1], [0, 0]),
-        ([3 * pi, 2 * pi], [1, 1]),
-        ([-3 * pi + 0.2, -4 * pi], [-1, -2]),
-        ([0, 0], [0, 0]),
-    ):
-        np.testing.assert_array_equal(whole_turns(jnp.array([*x, 0.0, 0.0])), turns)
-    plant, zero = v3("acrobot").task.plant, jnp.zeros(())
-    charged, free = Reward(turns=0.9), Reward()
-    up, wound = jnp.array([pi, 0, 0, 0]), jnp.array([-3 * pi, 4 * pi, 0, 0])
-
-    def paid(reward, x):
-        return float(surrogate_reward(plant, reward, 0.45, x, zero, zero))
-
-    assert paid(charged, up) == paid(free, up)
-    assert paid(charged, wound) == pytest.approx(paid(free, wound) - 0.9 * 3, abs=1e-4)
-    assert paid(charged, wound.at[0].set(0.0)) == paid(free, wound.at[0].set(0.0))
-    env = Env(EnvConfig(reward=charged), v3("acrobot").task)
-    state = env.observe(wound, zero, None, None, zero)
-    np.testing.assert_array_equal(state.privileged, [-1, 2, 0])
-    assert len(env.mirrored[1]) == 3
-    mirrored = env.observe(-wound, zero, None, None, zero)
-    np.testing.assert_array_equal(mirrored.privileged, state.privileged * np.array(env.mirrored[1]))

@@ -16,6 +16,7 @@ from jaxpend.boards import v2
 from jaxpend.config import (
     DemonstrationConfig,
     GradientConfig,
+    GuardConfig,
     Objective,
     SACConfig,
     SACRun,
@@ -320,3 +321,12 @@ def test_the_last_halving_is_in_the_middle(contestants, kept):
     times = {2: (0, 39, 40, 79), 3: (0, 20, 39, 40), 5: (9, 10, 20, 40)}[contestants]
     assert [contest.kept(done) for done in times] == list(map(int, kept))
     assert contest.kept(79) == 1
+
+
+def test_snes_is_left_out_where_it_has_no_generations(tmp_path):
+    none = SNESConfig(generations=0)
+    assert SNES.of(TrainRun(snes=none), shipped_network(), TASK) is None
+    with refused("snes.generations is 0", start=""):
+        SNES.of(SNESRun(snes=none), shipped_network(), TASK)
+    with refused("snes.generations is 0; a guard needs some", start=""):
+        TrainRun(snes=none, guard=GuardConfig(observe=True))

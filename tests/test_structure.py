@@ -13,14 +13,14 @@ errors files arrays robots pytree fields observation config config_files termina
 plant
 designs resets
 scenario
-variations
+variations hardware
 stepping
 controller
 rollout
 criteria
 boards
 score sweep
-robustness
+robustness fleet
 trajopt
 controllers
 trajopt.search leaderboard

@@ -49,12 +49,17 @@ COMMANDS = {
     ),
     "score": Command(
         "judge a controller",
-        "official v2 score of a policy or a recorded run, in float64",
+        "official score of a policy or a recorded run",
         "--robot acrobot --policy runs/mine/policy.npz --json -",
     ),
     "robustness": Command(
         "judge a controller",
         "six-criterion robustness benchmark of a controller",
+        "--robot pendubot --policy runs/mine/policy.npz",
+    ),
+    "hardware": Command(
+        "judge a controller",
+        "how often it stands on a fleet of real robots, without and with pushes",
         "--robot pendubot --policy runs/mine/policy.npz",
     ),
     "leaderboard": Command(

@@ -15,6 +15,7 @@ from ..config import GradientRun, Run, SACRun, Search, SNESRun, TrainRun
 from ..errors import JaxpendError
 from ..fields import BoardName, Count, Natural, Positive, Robot, Seed
 from .exporting import export as export
+from .fleets import hardware as hardware
 from .importing import import_ as import_
 from .judging import Subject, board_of, of_draws
 from .output import ARRAYS, JSON, MARKDOWN, check_file, check_folder, emit, emit_json
@@ -151,13 +152,9 @@ def score(
     from .. import boards
     from .tables import score_table
 
-    judged_on = boards.hardware(subject.board) if hardware else subject.board
-    if seed is not None and judged_on.seeds == 1:
-        raise JaxpendError(f"--seed names a draw, of which the {board} board has none")
+    judged_on = _drawn(boards.hardware(subject.board) if hardware else subject.board, seed, save)
     judged_on = of_draws(judged_on, draws)
     if save is not None:
-        if seed is None and judged_on.seeds > 1:
-            raise JaxpendError("--save writes one run; name its draw, such as --seed 0")
         from ..interop.csv import check_target
 
         check_target(save)
@@ -170,6 +167,15 @@ def score(
         one = seed is not None or csv is not None
         score_table({name: result}, dataclasses.replace(judged_on, seeds=1) if one else judged_on)
     emit_json(result, json)
+
+
+def _drawn(board, seed, save):
+    """The board. Refuse options that name a draw where it has none, and a file for several."""
+    if seed is not None and board.seeds == 1:
+        raise JaxpendError(f"--seed names a draw, of which the {board.name} board has none")
+    if save is not None and seed is None and board.seeds > 1:
+        raise JaxpendError("--save writes one run; name its draw, such as --seed 0")
+    return board
 
 
 def _apart(**files):

@@ -13,7 +13,14 @@ from ..terminal import console
 if TYPE_CHECKING:
     from ..boards import Board
 
-__all__ = ["leaderboard_table", "robustness_table", "runs_table", "score_table", "seeds_table"]
+__all__ = [
+    "hardware_table",
+    "leaderboard_table",
+    "robustness_table",
+    "runs_table",
+    "score_table",
+    "seeds_table",
+]
 
 HEADINGS_OF_RUNS = ("run", "robot", "stages", "seed", "state", "score", "time", "date")
 COLOURS = {"finished": "green", "running": "cyan", "interrupted": "yellow", "broken": "red"}
@@ -82,6 +89,20 @@ def robustness_table(result: Mapping[str, Any], board: "Board") -> None:
     if worst:
         values = ", ".join(f"{k} = {v:.3g}" for k, v in (worst["values"] or {}).items())
         console.print(f"{100 * worst['failures']:.1f} % of combined imperfections fail; {values}")
+
+
+def hardware_table(result: Mapping[str, Any], name: str) -> None:
+    """Print a ``fleet.Fleet`` (``as_dict``): how many robots stand in each condition."""
+    title = f"{result['robot']}, {name}: {result['robots']} robots, {result['preset']}"
+    table = _table("", "stand [%]", "95 % [%]", "score", "down [s]", "diverged", title=title)
+    for condition, found in result["conditions"].items():
+        low, high = (100 * end for end in found["interval"])
+        down = "" if found["down"] is None else f"{found['down']:.2f}"
+        share = Text(f"{100 * found['success']:.1f}", "bold")
+        row = (share, f"{low:.1f} to {high:.1f}", f"{found['score']:.3f}", down)
+        table.add_row(condition, *row, str(found["diverged"]))
+    console.print(table)
+    console.print("down: below the line after it was first reached, where it stands", style="dim")
 
 
 def leaderboard_table(result: Mapping[str, Any], board: "Board") -> None:

@@ -11,6 +11,7 @@ import json
 import re
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ __all__ = [
     "stack",
     "strips_figure",
     "svg",
+    "write_hardware",
     "write_robustness",
 ]
 
@@ -106,6 +108,34 @@ def stack(
 def panel(draw: Callable[..., Any], *data: Any, **options: Any) -> Figure:
     """``draw(axes, *data, **options)`` alone on a figure."""
     return stack([lambda axes: draw(axes, *data, **options)])
+
+
+# --- fleets --------------------------------------------------------------------------------
+
+
+def _along(axes, name: str, found: dict[str, list[float]]) -> None:
+    """The share of robots that stand over one quantity, a curve for each condition."""
+    for colour, (condition, shares) in zip(("one", "two"), list(found.items())[1:], strict=True):
+        values = [100 * share for share in shares]
+        axes.plot(found["values"], values, "o-", color=PALETTE[colour], label=condition)
+    axes.set(title=name, ylim=(-3, 103), ylabel="stand [%]")
+
+
+def write_hardware(result: dict[str, Any], folder: Path) -> Path:
+    """Picture and JSON of a ``fleet.Fleet`` (``as_dict``), in a folder; the path of the picture."""
+    units = {"delay": "delay [s]", "push": "strongest push [N m]", "responsiveness": "response"}
+    draws = [
+        partial(_along, name=units.get(name, f"{name} / nominal"), found=found)
+        for name, found in result["by"].items()
+    ]
+    title = f"{result['robot']}: robots that stand, {result['preset']}"
+    figure = stack(draws, columns=4, size=(3.2, 2.4), title=title)
+    figure.axes[0].legend()
+    path = folder / f"hardware_{result['robot']}.png"
+    folder.mkdir(parents=True, exist_ok=True)
+    save(figure, path)
+    write_atomically(path.with_suffix(".json"), to_json(result, indent=2) + "\n")
+    return path
 
 
 # --- robustness ----------------------------------------------------------------------------

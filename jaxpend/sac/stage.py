@@ -92,7 +92,7 @@ class SAC(Stage[SACState | None, SACState, Controller]):
     name, title, unit, column = "sac", "SAC", "environment steps", "env_steps"
     heading, scores = "after SAC", ("score",)
     charts = (
-        Chart("Official score", {"best so far": "best", "now": "score"}, "v2 score"),
+        Chart("Official score", {"best so far": "best", "now": "score"}, "score"),
         Chart("Reward", {"reward": "reward"}, "mean of a step"),
         Chart("Temperature", {"temperature": "temperature"}, log=True),
         Chart("Entropy of the policy", {"entropy": "entropy"}, "nats"),

@@ -1,0 +1,91 @@
+"""A real robot: everything is a little wrong at once, from one robot to the next.
+
+A ``Spread`` says how far the parameters of a robot may be from those that were identified, and
+what its sensors and motor are like; ``PRESETS`` holds three. ``draw`` makes a scenario of it: one
+robot, which is the same for a whole run.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from .plant import Plant
+from .scenario import DT, Encoder, Scenario, random_pulses
+
+__all__ = ["PRESETS", "Spread", "draw"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Spread:
+    """How robots of one design differ; hashable. Uniform, where nothing else is said."""
+
+    inertial: float = 0.1  # share by which masses, centres, lengths and inertias are off
+    friction: float = 0.5  # the same of damping, Coulomb friction and motor inertia
+    encoder: float = 2 * math.pi / 4096  # rad, a step of the measured angles
+    filtered: float = 0.008  # s, time constant of the velocities, which are differences of angles
+    angle_noise: float = 0.0  # rad, largest standard deviation
+    velocity_noise: float = 0.1  # rad/s, largest standard deviation
+    delay: float = 0.01  # s, longest, of measurements
+    torque_noise: float = 0.05  # N m, largest standard deviation
+    response: float = 0.8  # least share of a change of the torque that is made in a step
+    push: tuple[float, float] = (0.5, 3.0)  # N m, of a disturbance pulse, where there are pushes
+    pushes: int = 2  # on each joint in a run
+
+
+# "identified": as well as a robot is known after identification. "wide": as one that is not.
+# "authors": what the noisy training of Evolutionary SAC drew (arXiv 2409.08938): noise of 0.01,
+# a delay of 0.04 to 0.06 s, a response of 0.85 to 0.95, pulses of 0.4 to 0.6 N m.
+PRESETS = {
+    "identified": Spread(),
+    "wide": Spread(inertial=0.25, friction=1.0),
+    "authors": Spread(
+        inertial=0.0, friction=0.0, encoder=0.0, filtered=0.0, angle_noise=0.02,
+        velocity_noise=0.02, delay=0.06, torque_noise=0.0, response=0.85, push=(0.4, 0.6),
+    ),
+}  # fmt: skip
+
+
+def draw(spread: Spread, plant: Plant, key: jax.Array, *, pushed: Any, duration: float) -> Scenario:
+    """A robot with its sensors and motor; ``key`` is consumed, ``pushed`` is a bool (), traced.
+
+    Pushes end 2 s before the end of a run of ``duration`` s, so that it can stand after them.
+    """
+    keys = dict(zip(("plant", "rest", "pulses"), jax.random.split(key, 3), strict=True))
+    parts = jax.random.uniform(keys["plant"], (6, 2), minval=-1.0, maxval=1.0)
+    mass, com, length, inertia, damping, coulomb = parts
+    rest = jax.random.uniform(keys["rest"], (6,))
+    friction = jnp.zeros(2) if plant.coulomb_friction is None else plant.coulomb_friction
+    motor = 1 + spread.friction * (2 * rest[0] - 1)
+    # Of the inertia, that about the centre of mass is off: what no body has cannot come out.
+    about_com = plant.inertia - plant.mass * plant.com**2
+    new_mass = plant.mass * (1 + spread.inertial * mass)
+    new_com = plant.com * (1 + spread.inertial * com)
+    robot = plant.replace(
+        mass=new_mass,
+        com=new_com,
+        length=plant.length * (1 + spread.inertial * length),
+        inertia=new_mass * new_com**2 + about_com * (1 + spread.inertial * inertia),
+        damping=plant.damping * (1 + spread.friction * damping),
+        coulomb_friction=friction * (1 + spread.friction * coulomb),
+        motor_inertia=plant.motor_inertia * motor,
+    )
+    angle, speed = spread.angle_noise * rest[1], spread.velocity_noise * rest[2]
+    pulses = random_pulses(
+        keys["pulses"], duration=duration - 2.0, per_joint=spread.pushes, amplitude=spread.push
+    )
+    encoder = None
+    if spread.encoder:
+        weight = DT / (DT + spread.filtered)
+        encoder = Encoder(jnp.full(2, spread.encoder), jnp.asarray(weight), jnp.asarray(DT))
+    return Scenario(
+        robot,
+        measurement_noise=jnp.stack([angle, angle, speed, speed]),
+        delay=jnp.full(4, jnp.round(spread.delay / DT * rest[3]).astype(jnp.int32)),
+        torque_noise=spread.torque_noise * rest[4] * (plant.torque_limit > 0),
+        responsiveness=spread.response + (1 - spread.response) * rest[5],
+        pulses=pulses.replace(amplitude=jnp.where(pushed, pulses.amplitude, 0.0)),
+        encoder=encoder,
+    )

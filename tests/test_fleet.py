@@ -1,0 +1,147 @@
+"""Robots that differ from the nominal one in everything at once, and judging on many of them."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import refused
+
+from jaxpend.boards import HARDWARE, v2
+from jaxpend.cli.app import main
+from jaxpend.controller import Feedback, Zero
+from jaxpend.controllers.files import load_policy
+from jaxpend.fleet import CONDITIONS, judge_fleet, wilson
+from jaxpend.hardware import PRESETS, Spread, draw
+from jaxpend.plant import mass_matrix
+from jaxpend.rollout import rollout
+from jaxpend.scenario import Encoder, Scenario
+
+TASK = HARDWARE["pendubot"].task
+KEY = jax.random.key(0)
+
+
+def drawn(spread, count, pushed=True):
+    def one(key):
+        return draw(spread, TASK.plant, key, pushed=jnp.asarray(pushed), duration=10.0)
+
+    return jax.vmap(one)(jax.random.split(KEY, count))
+
+
+@pytest.mark.parametrize("name", ["identified", "wide"])
+def test_every_parameter_of_a_robot_is_off_within_its_range(name):
+    spread, robots, nominal = PRESETS[name], drawn(PRESETS[name], 4000), TASK.plant
+    for field, share in {
+        "mass": spread.inertial, "com": spread.inertial, "length": spread.inertial,
+        "damping": spread.friction, "coulomb_friction": spread.friction,
+    }.items():  # fmt: skip
+        factor = np.asarray(getattr(robots.plant, field) / getattr(nominal, field))
+        assert (np.abs(factor - 1) <= share * 1.0001).all()
+        np.testing.assert_allclose(factor.std(axis=0), share / np.sqrt(3), rtol=0.05)
+        # Those of the two joints, and of other fields, are drawn apart.
+        assert abs(np.corrcoef(factor.T)[0, 1]) < 0.05
+    motor = np.asarray(robots.plant.motor_inertia / nominal.motor_inertia)
+    np.testing.assert_allclose(motor.std(), spread.friction / np.sqrt(3), rtol=0.05)
+    # The inertia about the centre of mass is positive, and the mass matrix positive definite.
+    assert (robots.plant.inertia > robots.plant.mass * robots.plant.com**2).all()
+    upright = jnp.array([jnp.pi, 0.0, 0.0, 0.0])
+    assert (np.linalg.eigvalsh(jax.vmap(mass_matrix, (0, None))(robots.plant, upright)) > 0).all()
+    delay = np.asarray(robots.delay[:, 0])
+    assert (delay.min(), delay.max()) == (0, 5)
+    assert (robots.responsiveness >= 0.8).all()
+    assert not np.asarray(robots.torque_noise[:, 1]).any()
+
+
+def test_pushes_are_pulses_on_both_joints_that_leave_time_to_stand():
+    robots, calm = drawn(Spread(push=(1.0, 2.0)), 300), drawn(Spread(push=(1.0, 2.0)), 300, False)
+    size = np.abs(np.asarray(robots.pulses.amplitude))
+    assert (size.min() >= 1.0, size.max() <= 2.0) == (True, True)
+    assert np.asarray(robots.pulses.time).max() < 8.0
+    assert not np.asarray(calm.pulses.amplitude).any()
+    np.testing.assert_array_equal(robots.plant.mass, calm.plant.mass)
+
+
+def test_an_encoder_gives_angles_in_steps_and_their_filtered_differences():
+    step, dt = 0.01, 0.002
+    for weight in (1.0, 0.25):
+        encoder = Encoder(jnp.full(2, step), jnp.asarray(weight), jnp.asarray(dt))
+        scenario = Scenario(v2("pendubot").task.plant, jnp.array([1.0, 0.0, 0.3, 0.0]))
+        law = Feedback(lambda t, x: jnp.stack([1.5 * jnp.sin(9 * t), 0.0 * t]))
+        run = rollout(scenario.replace(encoder=encoder), law, KEY, duration=1.0)
+        x, seen = np.asarray(run.x[:-1], float), np.asarray(run.x_measured, float)
+        angles = step * np.round(x[:, :2] / step)
+        # Rounding of float32 may put an angle into the next step.
+        assert (np.abs(seen[:, :2] - angles) < 1e-5).mean() > 0.99
+        wanted, speed = [], x[0, 2:]
+        for k in range(len(x)):
+            if k:
+                speed = speed + weight * ((seen[k, :2] - seen[k - 1, :2]) / dt - speed)
+            wanted.append(speed)
+        np.testing.assert_allclose(seen[:, 2:], wanted, atol=2e-2)
+        noisy = scenario.replace(encoder=encoder, measurement_noise=jnp.array([0, 0, 0.5, 0.5]))
+        loud = np.asarray(rollout(noisy, law, KEY, duration=1.0).x_measured, float)
+        np.testing.assert_allclose((loud - seen)[:, 2:].std(axis=0), 0.5, rtol=0.1)
+        np.testing.assert_allclose(loud[:, :2], seen[:, :2], atol=1e-5)
+
+
+def easy(**fields):
+    """Robots that are all but nominal, judged for a second from upright."""
+    spread = Spread(
+        inertial=1e-3, friction=0.0, encoder=0.0, velocity_noise=0.0, delay=0.0, torque_noise=0.0,
+        response=1.0, push=(5.0, 6.0),
+    )  # fmt: skip
+    return dataclasses.replace(TASK, robots=dataclasses.replace(spread, **fields))
+
+
+def test_what_hangs_does_not_stand_and_has_never_been_up():
+    found = judge_fleet(Zero(), easy(), KEY, robots=130)
+    assert found.stands.shape == (2, 130)
+    assert not found.stands.any()
+    np.testing.assert_allclose(found.down[0], 10.0)
+    assert found.down[1].max() <= 10.0
+    said = found.as_dict()
+    assert [said["conditions"][name]["success"] for name in CONDITIONS] == [0.0, 0.0]
+    assert said["conditions"]["with pushes"]["down"] is None
+    assert len(said["worst"]) == 5
+    assert len(said["by"]["mass 1"]["values"]) == 6
+    json.dumps(said)
+
+
+def test_a_spinning_arm_does_not_stand_for_two_seconds():
+    t = np.arange(0, 10, 0.002)
+    x = np.zeros((3, len(t), 4))
+    x[0, :, 0] = np.pi
+    x[1, :, 0] = np.pi + 4 * np.sin(9 * t)  # above the line now and then, and at the end
+    x[1, -1] = [np.pi, 0, 0.5, 0]
+    x[2, :, 0] = np.where(t < 8.1, 0, np.pi)
+    np.testing.assert_array_equal(TASK.stands(jnp.asarray(x)), [True, False, False])
+    assert np.asarray(v2("pendubot").task.stands(jnp.asarray(x))).all()
+
+
+def test_wilson_intervals_are_those_of_the_tables():
+    np.testing.assert_allclose(wilson(8, 10), [0.4902, 0.9433], atol=1e-4)
+    np.testing.assert_allclose(wilson(0, 10), [0.0, 0.2775], atol=1e-4)
+
+
+def test_what_cannot_be_judged_is_one_sentence():
+    with refused("this task has no robots that differ", start=""):
+        judge_fleet(Zero(), v2("pendubot").task, KEY)
+    with refused("robots is 0", start=""):
+        judge_fleet(Zero(), TASK, KEY, robots=0)
+    with refused("for the acrobot, not for the pendubot", start="this controller is"):
+        judge_fleet(load_policy("acrobot"), TASK, KEY)
+
+
+def test_the_command_writes_a_picture_and_numbers(monkeypatch, capsys, tmp_path):
+    line = f"hardware --controller lqr --robots 3 --out {tmp_path / 'found'} --json -"
+    monkeypatch.setattr("sys.argv", ["jaxpend", *line.split()[1:]])
+    with pytest.raises(SystemExit) as exit_:
+        main("hardware")
+    found = json.loads(capsys.readouterr().out)
+    assert exit_.value.code == 0
+    assert (found["robots"], found["preset"]) == (3, "identified")
+    assert {p.name for p in (tmp_path / "found").iterdir()} == {
+        "hardware_pendubot.png", "hardware_pendubot.json",
+    }  # fmt: skip
