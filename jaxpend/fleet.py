@@ -123,11 +123,9 @@ def _tried(controller: Controller, keys: jax.Array, task: Task) -> tuple[Any, ..
         good = task.stands(run.x, length) & ~c.diverged
         return (good, task.score(c), down, c.diverged), off(scenario, task.plant)
 
-    without, with_ = (
-        jax.vmap(one, (0, None))(keys, jnp.asarray(pushed)) for pushed in (False, True)
-    )
-    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), without[0], with_[0])
-    return both, with_[1]
+    each = jax.vmap(jax.vmap(one, (0, None)), (None, 0))
+    both, quantities = each(keys, jnp.array([False, True]))
+    return both, jax.tree.map(lambda values: values[1], quantities)
 
 
 def judge_fleet(

@@ -165,13 +165,16 @@ def official(controller: Controller, judged_on: Board | str) -> dict[str, Any]:
     with jax.enable_x64(False):
         ready = _ready(controller, task)
         for first in range(0, judged_on.seeds, CHUNK):
-            seeds = range(first, min(first + CHUNK, judged_on.seeds))
+            # The last ones are filled up, so that all share one program.
+            seeds = np.arange(first, first + min(CHUNK, judged_on.seeds))
+            seeds = np.minimum(seeds, judged_on.seeds - 1).tolist()
             scenarios = [judged_on.drawn(seed) for seed in seeds]
             batch = jax.tree.map(lambda *leaves: np.stack(leaves), *scenarios)
             c, passive = _trials(ready, batch, task)
             _refuse_passive(float(passive.max()), task)
             found.append(jax.tree.map(np.asarray, c))
-    c = jax.tree.map(lambda *parts: np.concatenate(parts).astype(float), *found)
+    count = judged_on.seeds
+    c = jax.tree.map(lambda *parts: np.concatenate(parts)[:count].astype(float), *found)
     scores = np.asarray(task.score(c), float)
     spread = float(scores.std(ddof=1))
     mean, error = float(scores.mean()), 1.96 * spread / len(scores) ** 0.5
