@@ -17,6 +17,12 @@ ifeq ($(filter $(TASK),v2 global hardware),)
 $(error TASK is '$(TASK)'; it must be v2, global or hardware)
 endif
 
+ifneq ($(and $(filter global hardware,$(TASK)),$(filter-out file,$(origin RECIPE))),)
+$(error TASK is '$(TASK)' and RECIPE is '$(RECIPE)'; recipes are of v2, leave one of them out)
+endif
+BOARD = --board $(or $(BOARD_$(TASK)),$(TASK))
+BOARD_global := v3
+
 # What `make train` reads: a recipe that ships with the package.
 CONFIG = $(if $(filter v2,$(TASK)),$(CONFIG_OF_RECIPE),$(TASK)_$(ROBOT))
 CONFIG_OF_RECIPE = $(or $(CONFIG_$(RECIPE)),$(error RECIPE is '$(RECIPE)'; it must be demonstrated, learned or plain))
@@ -25,7 +31,7 @@ CONFIG_learned := learned_$(ROBOT)
 CONFIG_plain := plain
 
 .DEFAULT_GOAL := help
-.PHONY: help install train snes score robustness leaderboard runs report docs test lint bench clean
+.PHONY: help install train snes score robustness hardware leaderboard runs report docs test lint bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -46,16 +52,19 @@ train: $(STAMP)  ## train for TASK=v2|global|hardware, v2 by RECIPE=...; ends wi
 	$(BIN)/jaxpend train --config $(CONFIG) --robot $(ROBOT) --seed $(SEED) --run $(RUN) $(ARGS)
 
 snes: $(STAMP)  ## fine-tune by SNES: ARGS='--policy FILE' or '--controller NAME'
-	$(BIN)/jaxpend snes --robot $(ROBOT) --seed $(SEED) $(ARGS)
+	$(BIN)/jaxpend snes $(BOARD) --robot $(ROBOT) --seed $(SEED) $(ARGS)
 
 score: $(STAMP)  ## official score of the shipped policy, or ARGS='--policy FILE'
-	$(BIN)/jaxpend score --robot $(ROBOT) $(ARGS)
+	$(BIN)/jaxpend score $(BOARD) --robot $(ROBOT) $(ARGS)
 
 robustness: $(STAMP)  ## six-criterion robustness of the shipped policy, or ARGS='--policy FILE'
 	$(BIN)/jaxpend robustness --robot $(ROBOT) --seed $(SEED) $(ARGS)
 
+hardware: $(STAMP)  ## how many of 1000 real robots the shipped policy brings up, or ARGS='--policy FILE'
+	$(BIN)/jaxpend hardware --robot $(ROBOT) --seed $(SEED) $(ARGS)
+
 leaderboard: $(STAMP)  ## every known controller on the board of ROBOT, next to the published rows
-	$(BIN)/jaxpend leaderboard --robot $(ROBOT) $(ARGS)
+	$(BIN)/jaxpend leaderboard $(BOARD) --robot $(ROBOT) $(ARGS)
 
 runs: $(STAMP)  ## list the runs with their state and scores
 	$(BIN)/jaxpend runs $(ARGS)

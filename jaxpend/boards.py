@@ -40,6 +40,9 @@ __all__ = [
 ]  # fmt: skip
 
 
+# Of the key of resets: beyond the number of any part that the same key is split into elsewhere,
+# since ``fold_in(key, i)`` is the i-th of those.
+RESETS_STREAM = 2**31 - 7
 TRIALS = 16  # of a task in which chance plays: what a judgement in training is the mean of
 
 
@@ -57,7 +60,7 @@ class Task:
     duration: float = 10.0  # s
     height: float = HEIGHT  # the line, as a fraction of the stretched height
     scoring: Callable[[Criteria], jax.Array] = ScoreV2()  # hashable
-    robots: Spread | None = None  # how real ones differ; None: one imperfection at a time
+    spread: Spread | None = None  # how real ones differ; None: one imperfection at a time
     standing: float = 0.0  # s, at the end, for which it has to stand; 0: in its last state
     resets: int = 0  # times in a run that somebody throws the arm, see ``jaxpend.resets``
 
@@ -94,11 +97,11 @@ class Task:
     @property
     def shipped(self) -> str:
         """Name of the policy that ships for it."""
-        kind = "hardware_" if self.robots else "global_" if self.resets else ""
+        kind = "hardware_" if self.spread else "global_" if self.resets else ""
         return f"{kind}{self.robot}"
 
     @property
-    def trials(self) -> int:
+    def repeats(self) -> int:
         """Runs of which training takes the mean score: one, or several where chance plays."""
         return TRIALS if self.resets else 1
 
@@ -107,23 +110,23 @@ class Task:
         return self._thrown(Scenario(self.plant), key)
 
     def sample(self, key: jax.Array, share: float = 1.0) -> Scenario:
-        """The same with random imperfections in a ``share`` of them; ``key`` is consumed."""
+        """A trial with random imperfections, in a ``share`` of cases; ``key`` is consumed."""
         return self._thrown(self.imperfect(self.plant, key, share), key)
 
     def imperfect(self, plant: Plant, key: jax.Array, share: float = 1.0) -> Scenario:
         """Random imperfections around a nominal plant; ``key`` is consumed.
 
-        Of a task with ``robots`` it is one of those, and a ``share`` of them is pushed; else it
-        has one imperfection of the robustness benchmark's six kinds (``variations.sample``).
+        Of a task with a ``spread`` it is a robot of that, and a ``share`` of them is pushed; else
+        it has one imperfection of the robustness benchmark's six kinds (``variations.sample``).
         """
-        if self.robots is None:
+        if self.spread is None:
             return sample(plant, key, share)
         key_robot, key_pushed = jax.random.split(key)
         pushed = jax.random.bernoulli(key_pushed, share)
-        return draw(self.robots, plant, key_robot, pushed=pushed, duration=self.duration)
+        return draw(self.spread, plant, key_robot, pushed=pushed, duration=self.duration)
 
     def stands(self, x: jax.Array, length: jax.Array | None = None) -> jax.Array:
-        """Whether a run, states (..., N, 4), ends well: () bool of each.
+        """Whether runs, states (..., N, 4), end well: (...) bool.
 
         Its last state is upright (``criteria.upright``), or, of a task with ``standing``, the tip
         is above the line in all of the last so many s, which a spinning arm's is not; ``length``
@@ -138,7 +141,7 @@ class Task:
     def _thrown(self, scenario: Scenario, key: jax.Array) -> Scenario:
         if not self.resets:
             return scenario
-        key = jax.random.fold_in(key, 1)  # apart from what else is drawn
+        key = jax.random.fold_in(key, RESETS_STREAM)
         resets = random_resets(key, self.resets, dt=self.dt, duration=self.duration)
         return self.with_resets(scenario, resets)
 
@@ -217,7 +220,7 @@ class Board:
     trials: Callable[[Plant], list[Strip]] | None = strips
     # Title, performance, robustness.
     published: tuple[tuple[str, float, float | None], ...] = ()
-    seeds: int = 1  # official draws, from 0 on, that a score is the mean of
+    draws: int = 1  # official draws, from 0 on, that a score is the mean of
     columns: tuple[str, ...] = tuple(V2_OFFICIAL)  # criteria that its tables show
 
     @property
@@ -230,6 +233,9 @@ class Board:
         task, scenario = self.task, Scenario(self.task.plant)
         if not task.resets:
             return None
+        plant = scenario.plant  # which is traced in a batch: friction has to be known to be none
+        if not np.any(plant.coulomb_friction):
+            scenario = scenario.replace(plant=plant.replace(coulomb_friction=None))
         resets = official_resets(seed, task.resets, dt=task.dt, duration=task.duration)
         return task.with_resets(scenario, resets)
 
@@ -289,7 +295,7 @@ V3 = {
         Task(robot, designs.COMPETITION, duration=60.0, scoring=ScoreV3(60.0), resets=15),
         trials=None,
         published=_PUBLISHED_V3[robot],
-        seeds=1000,
+        draws=1000,
         columns=("uptime", "number_of_swingups", "energy", "tau_cost", "velocity_cost"),
     )
     for robot in ROBOTS
@@ -302,7 +308,7 @@ HARDWARE = {
             robot,
             tuple((name, v) for name, v in designs.parameters("C.1/1.0").items()),
             scoring=ScoreV2(tuple(V2_HARDWARE.items())),
-            robots=PRESETS["identified"],
+            spread=PRESETS["identified"],
             standing=2.0,
         ),
         trials=None,
@@ -335,6 +341,8 @@ def hardware(judged_on: "Board | str") -> Board:
     Raises ``JaxpendError`` for a board that is not scored as v2 is.
     """
     simulated = board(judged_on)
+    if simulated.task.spread is not None:
+        return simulated
     if not isinstance(simulated.task.scoring, ScoreV2):
         raise JaxpendError(f"the {simulated.name} board has no normalisation for real robots")
     task = dataclasses.replace(simulated.task, scoring=ScoreV2(tuple(V2_HARDWARE.items())))

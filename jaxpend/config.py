@@ -109,7 +109,9 @@ class EnvConfig(Checked):
     # of 5 rad/s.
     random_starts: Share = 0.0
     thrown_starts: Share = 0.0  # share of episodes that start as a reset by hand leaves the arm
-    randomised: Share = 0.0  # share of episodes in a random scenario, see ``variations``
+    # Share of episodes in a random scenario, see ``variations``; of the hardware task all are,
+    # where it is not 0, and a share of the robots is pushed.
+    randomised: Share = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -287,7 +289,7 @@ class Run(Checked):
     """What every training run has."""
 
     robot: Robot = "pendubot"
-    board: BoardName = "v2"  # whose task it is; v3: the one of global policies
+    board: BoardName = "v2"  # whose task it is; v3: of global policies; hardware: of real robots
     plant: str = ""  # file of the parameters of another plant; empty: that of the boards
     design: str = ""  # or an identified one by name, such as C.1/1.0
     seed: Seed = 0
@@ -295,7 +297,8 @@ class Run(Checked):
     seeds: Annotated[int, Bounds(above=0, most=1000)] = 1
     # Several seeds in one computation; auto: on an accelerator.
     vmap: Literal["auto", "yes", "no"] = "auto"
-    # Name of the run folder; empty: ROBOT-seedSEED, of one stage alone ROBOT-STAGE-seedSEED.
+    # Name of the run folder; empty: ROBOT-seedSEED, of one stage alone ROBOT-STAGE-seedSEED, of
+    # another board than v2 ROBOT-BOARD-...
     run: str = ""
     runs: str = "runs"  # folder of the run folders
     checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
@@ -318,7 +321,8 @@ class Run(Checked):
         # A stage alone must not land in the folder of the whole run that it may start from.
         stage = {SACRun: "-sac", GradientRun: "-gradient", SNESRun: "-snes"}.get(type(self), "")
         seeds = f"s{self.seed}-{self.seed + self.seeds - 1}" if self.seeds > 1 else str(self.seed)
-        return Path(self.runs) / (self.run or f"{self.robot}{stage}-seed{seeds}")
+        task = "" if self.board == "v2" else f"-{self.board}"
+        return Path(self.runs) / (self.run or f"{self.robot}{task}{stage}-seed{seeds}")
 
     def of_seeds(self) -> list["Run"]:
         """A configuration for each seed; of several, each has a folder in ``folder``."""

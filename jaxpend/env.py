@@ -143,7 +143,7 @@ class Env:
             scenario = self.task.imperfect(self.plant, key_scenario, self.config.randomised)
             before, k = sensors(scenario, x, SLOTS), jnp.zeros((), jnp.int32)
             z = jax.tree.map(lambda z: z[0], draws(scenario, key_start, None, 1, x.dtype))
-            after, measured = measure(scenario, before, k, x, z)
+            after, measured = measure(scenario, before, k, x, z, DT)
             world = World(scenario, after, measured, jnp.zeros(2), k, key)
         return self.observe(x, zero, past, world, zero)
 
@@ -201,7 +201,7 @@ class Env:
             x, now = carry
             applied, k = actuate(scenario, torque, now.applied, now.k * dt, z), now.k + 1
             x = rk4_step(scenario.plant, x, applied, dt)
-            after, measured = measure(scenario, now.sensors, k, x, z)
+            after, measured = measure(scenario, now.sensors, k, x, z, dt)
             return (x, World(scenario, after, measured, applied, k, key)), None
 
         noise = draws(scenario, key_noise, None, steps, x.dtype)

@@ -24,7 +24,7 @@ from .rollout import rollout
 from .scenario import DT, Scenario
 from .sweep import at_least_one
 
-__all__ = ["Fleet", "judge_fleet", "off", "wilson"]
+__all__ = ["CONDITIONS", "Fleet", "judge_fleet", "off", "wilson"]
 
 CHUNK = 100  # robots at a time
 BINS = 6  # of each quantity, in which the share of robots that stand is given
@@ -59,7 +59,8 @@ class Fleet:
                 "down": float(self.down[i][good].mean()) if good.any() else None,
                 "diverged": int(self.diverged[i].sum()),
             }
-        result["by"] = {name: self._along(values) for name, values in self.quantities.items()}
+        varied = {name: values for name, values in self.quantities.items() if np.ptp(values)}
+        result["by"] = {name: self._along(values) for name, values in varied.items()}
         order = np.lexsort((-self.down.sum(axis=0), self.stands.sum(axis=0)))[:WORST]
         result["worst"] = [
             {name: float(values[robot]) for name, values in self.quantities.items()}
@@ -81,11 +82,9 @@ class Fleet:
 
 def wilson(successes: int, trials: int) -> list[float]:
     """Ends of the 95 % interval of a share, by the score of Wilson (1927)."""
-    z = 1.96
-    share, size = successes / trials, 1 + z**2 / trials
-    middle = (share + z**2 / (2 * trials)) / size
-    half = z * np.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2)) / size
-    return [float(middle - half), float(middle + half)]
+    from scipy.stats import binomtest
+
+    return list(binomtest(successes, trials).proportion_ci(0.95, "wilson"))
 
 
 def off(scenario: Scenario, nominal: Plant) -> dict[str, jax.Array]:
@@ -108,7 +107,7 @@ def off(scenario: Scenario, nominal: Plant) -> dict[str, jax.Array]:
 @partial(jax.jit, static_argnames="task")
 def _tried(controller: Controller, keys: jax.Array, task: Task) -> tuple[Any, ...]:
     """What becomes of the robots of some keys, pushed or not, and how they are off."""
-    spread, line = task.robots, task.height
+    spread, line = task.spread, task.height
     assert spread is not None
 
     def one(key: jax.Array, pushed: jax.Array) -> tuple[Any, ...]:
@@ -140,7 +139,7 @@ def judge_fleet(
 
     Args:
         controller: one for all.
-        task: with ``robots``, which says how they differ.
+        task: with a ``spread``, which says how they differ.
         key: split once a robot.
         robots: how many.
         say: told how many are done, after each chunk.
@@ -150,7 +149,7 @@ def judge_fleet(
             the other robot.
     """
     at_least_one(robots=robots)
-    if task.robots is None:
+    if task.spread is None:
         raise JaxpendError("this task has no robots that differ; take that of the hardware board")
     check_form(controller)
     check_robot(controller, task.robot)

@@ -35,7 +35,7 @@ from .config import GradientConfig, Run, TrainRun
 from .controller import Controller, check_controller
 from .controllers.policy import Policy
 from .controllers.search_space import coordinates
-from .criteria import EPSILON, upright
+from .criteria import EPSILON, ScoreV2
 from .errors import JaxpendError
 from .plant import rk4_step
 from .pytree import Pytree, pytree
@@ -134,7 +134,7 @@ def retained(config: GradientConfig, policy: Policy, task: Task) -> Retained:
             return policy(carry, *now)[0], obs
 
         seen = jax.lax.scan(step, policy.reset(key), (run.t[:-1], run.x_measured))[1][times]
-        return seen, jnp.broadcast_to(upright(run.x[-1]), times.shape)
+        return seen, jnp.broadcast_to(task.stands(run.x, scenario.plant.length), times.shape)
 
     obs, counts = jax.vmap(one)(scenarios, jax.random.split(key_runs, SHOWN))
     obs = obs.reshape(-1, obs.shape[-1])
@@ -271,6 +271,8 @@ class Gradient(SearchStage):
     def __init__(self, config: GradientConfig, policy: Any, task: Task):
         """Raises ``JaxpendError`` as ``init``."""
         super().__init__(config, policy, task)
+        if not isinstance(task.scoring, ScoreV2):
+            raise JaxpendError("the gradient climbs a smooth v2 score; this task has another score")
         if config.retention:
             _check_retention(policy)
             _check_time(config, task)

@@ -12,10 +12,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from .errors import JaxpendError
 from .plant import Plant
 from .scenario import DT, Encoder, Scenario, random_pulses
 
 __all__ = ["PRESETS", "Spread", "draw"]
+
+
+LONGEST = 0.06  # s, of a delay: what a rollout's buffer of past states holds by default
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,14 +34,29 @@ class Spread:
     velocity_noise: float = 0.1  # rad/s, largest standard deviation
     delay: float = 0.01  # s, longest, of measurements
     torque_noise: float = 0.05  # N m, largest standard deviation
-    response: float = 0.8  # least share of a change of the torque that is made in a step
+    response: float = 0.8  # least share of a change of the torque that a step makes; 1: all
     push: tuple[float, float] = (0.5, 3.0)  # N m, of a disturbance pulse, where there are pushes
     pushes: int = 2  # on each joint in a run
 
+    def __post_init__(self) -> None:
+        for name, most in {
+            "inertial": 1.0,
+            "friction": 1.0,
+            "response": 1.0,
+            "delay": LONGEST,
+        }.items():
+            if not 0 <= getattr(self, name) <= most:
+                raise JaxpendError(f"{name} is {getattr(self, name)}; it must be in 0 to {most:g}")
+        if not self.inertial < 1:
+            raise JaxpendError("inertial is 1; a robot without mass is none")
+        for name in ("encoder", "filtered", "angle_noise", "velocity_noise", "torque_noise"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise JaxpendError(f"{name} is {getattr(self, name)}; it must not be negative")
+
 
 # "identified": as well as a robot is known after identification. "wide": as one that is not.
-# "authors": what the noisy training of Evolutionary SAC drew (arXiv 2409.08938): noise of 0.01,
-# a delay of 0.04 to 0.06 s, a response of 0.85 to 0.95, pulses of 0.4 to 0.6 N m.
+# "authors": up to the worst that the noisy training of Evolutionary SAC drew (arXiv 2409.08938):
+# noise of 0.02, a delay of 0.06 s, a response of 0.85, pulses of 0.4 to 0.6 N m.
 PRESETS = {
     "identified": Spread(),
     "wide": Spread(inertial=0.25, friction=1.0),
@@ -59,8 +78,9 @@ def draw(spread: Spread, plant: Plant, key: jax.Array, *, pushed: Any, duration:
     rest = jax.random.uniform(keys["rest"], (6,))
     friction = jnp.zeros(2) if plant.coulomb_friction is None else plant.coulomb_friction
     motor = 1 + spread.friction * (2 * rest[0] - 1)
-    # Of the inertia, that about the centre of mass is off: what no body has cannot come out.
-    about_com = plant.inertia - plant.mass * plant.com**2
+    # Of the inertia, that about the centre of mass is off, and never negative: no body's is. That
+    # of some identified models is.
+    about_com = jnp.maximum(plant.inertia - plant.mass * plant.com**2, 0.0)
     new_mass = plant.mass * (1 + spread.inertial * mass)
     new_com = plant.com * (1 + spread.inertial * com)
     robot = plant.replace(
@@ -71,6 +91,7 @@ def draw(spread: Spread, plant: Plant, key: jax.Array, *, pushed: Any, duration:
         damping=plant.damping * (1 + spread.friction * damping),
         coulomb_friction=friction * (1 + spread.friction * coulomb),
         motor_inertia=plant.motor_inertia * motor,
+        actuation=jnp.ones(2),  # pushes move the passive joint too; its torque limit stays 0
     )
     angle, speed = spread.angle_noise * rest[1], spread.velocity_noise * rest[2]
     pulses = random_pulses(
@@ -78,8 +99,7 @@ def draw(spread: Spread, plant: Plant, key: jax.Array, *, pushed: Any, duration:
     )
     encoder = None
     if spread.encoder:
-        weight = DT / (DT + spread.filtered)
-        encoder = Encoder(jnp.full(2, spread.encoder), jnp.asarray(weight), jnp.asarray(DT))
+        encoder = Encoder(jnp.full(2, spread.encoder), jnp.asarray(spread.filtered))
     return Scenario(
         robot,
         measurement_noise=jnp.stack([angle, angle, speed, speed]),

@@ -1,7 +1,7 @@
-"""``jaxpend leaderboard``: every controller on the v2 board of a robot, next to the published rows.
+"""``jaxpend leaderboard``: every controller on a board of a robot, next to the published rows.
 
-Performance is the official score and its criteria in float64; robustness is the six-criterion
-benchmark in float32, as ``jaxpend robustness`` runs it.
+Performance is the official score and its criteria (``score.official``); robustness is the
+six-criterion benchmark in float32, as ``jaxpend robustness`` runs it.
 """
 
 import time
@@ -108,12 +108,14 @@ def markdown(board: Mapping[str, Any]) -> str:
     shown = [HEADINGS[name] for name in columns]
     criteria = [f"{heading} [{unit}]" for heading, unit, *_ in shown]
     headings = ["controller", "score", *criteria, *CRITERIA.values(), "robustness"]
+    measured = any(row["robustness"] is not None for row in board["rows"])
+    headings = headings if measured else headings[: 2 + len(criteria)]
     lines = [headings, ["---"] + ["---:"] * (len(headings) - 1)]
     for row in board["rows"]:
         line, by_key = cells(row, columns), row.get("robustness_by_key", ())
         if len(by_key) > 1:
             line[-1] += f" ({min(by_key):.3f} to {max(by_key):.3f})"
-        lines.append(line)
+        lines.append(line[: len(headings)])
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 

@@ -24,7 +24,12 @@ __all__ = [
 
 HOLD = 0.2  # s, that a reset lasts, and up to one step more
 JITTER = 1.0  # s, to either side, of the times that resets begin at
-PROPORTIONAL, INTEGRAL, DERIVATIVE, STEP = 10.0, 0.1, 1.0, 0.001  # N m/rad, 1/s, s; s
+PROPORTIONAL, INTEGRAL, DERIVATIVE, STEP = (
+    10.0,
+    0.1,
+    1.0,
+    0.001,
+)  # N m/rad, N m/(rad s), N m s/rad; s
 LIMIT = 6.0  # N m, of the PID law; gravity compensation comes on top
 # How often each joint is 0, 1 and 2 turns off in ``thrown``.
 TURNS = ((0.95, 0.05, 0.0), (0.6, 0.35, 0.05))

@@ -76,10 +76,11 @@ def sensors(scenario: Scenario, x0: jax.Array, slots: int) -> Sensors:
     return Sensors(states, None if scenario.encoder is None else x0)
 
 
-def measure(scenario: Scenario, sensors: Sensors, k, x, z):
+def measure(scenario: Scenario, sensors: Sensors, k, x, z, dt):
     """Delayed and noisy measurement, as an encoder gives it; with the sensors after it.
 
-    The noise of angles is in front of the encoder, that of velocities behind its filter.
+    The noise of angles is in front of the encoder, that of velocities behind its filter. ``dt`` is
+    the time from one measurement to the next, s.
     """
     states, seen = sensors.states, x
     if states is not None:
@@ -87,19 +88,16 @@ def measure(scenario: Scenario, sensors: Sensors, k, x, z):
         states = jax.lax.dynamic_update_slice_in_dim(states, x[None], k % slots, 0)
         lagged = jnp.maximum(k - scenario.delay, 0) % slots
         seen = jnp.take_along_axis(states, lagged[None], axis=0)[0]
-    noise = jnp.zeros(4)
-    if scenario.measurement_noise is not None:
-        noise = scenario.measurement_noise * z["measurement_noise"]
-        seen = seen + noise
+    sigma = scenario.measurement_noise
+    noisy = seen if sigma is None else seen + sigma * z["measurement_noise"]
     if (encoder := scenario.encoder) is None:
-        return Sensors(states, None), seen
+        return Sensors(states, None), noisy
     assert sensors.encoded is not None
-    before, angles = sensors.encoded, encoder.step * jnp.round(seen[:2] / encoder.step)
-    rate = jnp.where(k == 0, before[2:], (angles - before[:2]) / encoder.dt)
-    encoded = jnp.concatenate([angles, before[2:] + encoder.weight * (rate - before[2:])])
-    noisy = scenario.measurement_noise is not None
-    seen = encoded.at[2:].add(noise[2:]) if noisy else encoded
-    return Sensors(states, encoded), seen
+    before, angles = sensors.encoded, encoder.step * jnp.round(noisy[:2] / encoder.step)
+    rate = jnp.where(k == 0, before[2:], (angles - before[:2]) / dt)
+    filtered = before[2:] + dt / (dt + encoder.filtered) * (rate - before[2:])
+    after = Sensors(states, jnp.concatenate([angles, filtered]))
+    return after, jnp.concatenate([angles, filtered + (noisy - seen)[2:]])
 
 
 def actuate(scenario: Scenario, command, applied_before, t_pulse, z):
@@ -134,14 +132,18 @@ def _closed_loop(
 
     def step(carry, now):
         x, u, memory, hand, sensed = carry
-        sensed, measured = measure(scenario, sensed, now["k"], x, now["z"])
-        after, command = controller(memory, now["t"], measured)
+        sensed, measured = measure(scenario, sensed, now["k"], x, now["z"], dt)
+        seen = measured
+        if scenario.resets is not None:
+            holds, hand, torque = push(scenario.resets, hand, plant, now["k"], measured)
+            # Not a number: what a callback remembers, which is not in ``memory``, stays too.
+            seen = jnp.where(holds, jnp.nan, measured)
+        after, command = controller(memory, now["t"], seen)
         command = jnp.asarray(command, dtype)
         if command.shape != (2,):
             name = type(controller).__name__
             raise JaxpendError(f"{name} returns a torque of shape {command.shape}; it must be (2,)")
         if scenario.resets is not None:  # to the controller it is as if time had jumped
-            holds, hand, torque = push(scenario.resets, hand, plant, now["k"], measured)
             command = jnp.where(holds, torque, command)
             after = jax.tree.map(lambda old, new: jnp.where(holds, old, new), memory, after)
         u = actuate(scenario, command, u, now["t_pulse"], now["z"])

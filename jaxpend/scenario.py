@@ -45,8 +45,7 @@ class Encoder(Pytree):
     """Angles in steps, and velocities as their differences, through a filter of first order."""
 
     step: jax.Array  # (2,) rad
-    weight: jax.Array  # () of the newest difference, in (0, 1]
-    dt: jax.Array  # () s, from one measurement to the next
+    filtered: jax.Array  # () s, time constant of the filter; 0: the differences themselves
 
 
 @pytree
@@ -125,7 +124,7 @@ def random_pulses(
     )
 
 
-# What an imperfection that is there has no effect with; all that is missing has a place here.
+# What an imperfection of the benchmarks that is there has no effect with.
 NEUTRAL: dict[str, Any] = {
     "delay": np.zeros(4, "i4"),
     "responsiveness": np.ones(()),

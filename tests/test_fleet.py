@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from conftest import refused
 
+from jaxpend import designs
 from jaxpend.boards import HARDWARE, v2
 from jaxpend.cli.app import main
 from jaxpend.controller import Feedback, Zero
@@ -63,10 +64,23 @@ def test_pushes_are_pulses_on_both_joints_that_leave_time_to_stand():
     np.testing.assert_array_equal(robots.plant.mass, calm.plant.mass)
 
 
+def test_a_push_on_either_joint_moves_the_arm_but_no_torque_of_the_passive_one_does():
+    robot = jax.tree.map(lambda leaf: leaf[0], drawn(Spread(), 1, False))
+    still = rollout(robot, Zero(), KEY, duration=1.5)
+    drive = Feedback(lambda t, x: jnp.array([0.0, 3.0]))
+    np.testing.assert_array_equal(still.x, rollout(robot, drive, KEY, duration=1.5).x)
+    for joint in (0, 1):
+        push = jnp.zeros((2, 2)).at[joint, 0].set(2.0)
+        pulses = robot.pulses.replace(amplitude=push, time=jnp.full((2, 2), 1.0))
+        moved = rollout(robot.replace(pulses=pulses), Zero(), KEY, duration=1.5)
+        assert np.abs(moved.x - still.x).max() > 0.1
+
+
 def test_an_encoder_gives_angles_in_steps_and_their_filtered_differences():
     step, dt = 0.01, 0.002
-    for weight in (1.0, 0.25):
-        encoder = Encoder(jnp.full(2, step), jnp.asarray(weight), jnp.asarray(dt))
+    for filtered in (0.0, 0.006):
+        weight = dt / (dt + filtered)
+        encoder = Encoder(jnp.full(2, step), jnp.asarray(filtered))
         scenario = Scenario(v2("pendubot").task.plant, jnp.array([1.0, 0.0, 0.3, 0.0]))
         law = Feedback(lambda t, x: jnp.stack([1.5 * jnp.sin(9 * t), 0.0 * t]))
         run = rollout(scenario.replace(encoder=encoder), law, KEY, duration=1.0)
@@ -92,7 +106,7 @@ def easy(**fields):
         inertial=1e-3, friction=0.0, encoder=0.0, velocity_noise=0.0, delay=0.0, torque_noise=0.0,
         response=1.0, push=(5.0, 6.0),
     )  # fmt: skip
-    return dataclasses.replace(TASK, robots=dataclasses.replace(spread, **fields))
+    return dataclasses.replace(TASK, spread=dataclasses.replace(spread, **fields))
 
 
 def test_what_hangs_does_not_stand_and_has_never_been_up():
@@ -125,6 +139,24 @@ def test_wilson_intervals_are_those_of_the_tables():
     np.testing.assert_allclose(wilson(0, 10), [0.0, 0.2775], atol=1e-4)
 
 
+def test_a_spread_that_no_robots_have_is_one_sentence():
+    for field, value in {
+        "delay": 0.1, "inertial": 1.0, "friction": -0.1, "encoder": -1.0, "response": 1.1,
+    }.items():  # fmt: skip
+        with refused(f"{field} is", start=""):
+            Spread(**{field: value})
+
+
+def test_no_robot_of_any_design_has_an_inertia_that_no_body_has():
+    plant = designs.load("C.1", "3.0", robot="pendubot")
+
+    def inertia(key):
+        robot = draw(PRESETS["wide"], plant, key, pushed=jnp.asarray(True), duration=10.0).plant
+        return robot.inertia - robot.mass * robot.com**2
+
+    assert jax.vmap(inertia)(jax.random.split(KEY, 200)).min() >= -1e-6
+
+
 def test_what_cannot_be_judged_is_one_sentence():
     with refused("this task has no robots that differ", start=""):
         judge_fleet(Zero(), v2("pendubot").task, KEY)
@@ -143,5 +175,5 @@ def test_the_command_writes_a_picture_and_numbers(monkeypatch, capsys, tmp_path)
     assert exit_.value.code == 0
     assert (found["robots"], found["preset"]) == (3, "identified")
     assert {p.name for p in (tmp_path / "found").iterdir()} == {
-        "hardware_pendubot.png", "hardware_pendubot.json",
+        "identified_pendubot.png", "identified_pendubot.json",
     }  # fmt: skip

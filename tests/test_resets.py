@@ -12,11 +12,13 @@ from conftest import refused
 
 from jaxpend.boards import Task, v2, v3
 from jaxpend.cli.app import main
-from jaxpend.config import EnvConfig
+from jaxpend.config import EnvConfig, GradientConfig, TrainRun
 from jaxpend.controller import Feedback, Zero
+from jaxpend.controllers.callback import realaigym
 from jaxpend.controllers.files import load_policy
 from jaxpend.controllers.policy import network_in
 from jaxpend.env import Env, _thrown_states
+from jaxpend.gradient import Gradient
 from jaxpend.pytree import pytree
 from jaxpend.resets import Resets, held, official_resets, random_resets, stamps, thrown
 from jaxpend.rollout import rollout
@@ -131,26 +133,26 @@ def short(robot, duration=5.0, resets=1, **fields):
 
 def test_the_score_is_the_mean_of_the_draws():
     robot = "acrobot"
-    board = short(robot, seeds=70)
+    board = short(robot, draws=70)
     policy = network_in(load_policy(robot))
     found = official(policy, board)
     scores = np.array([official_run(policy, board, seed)[1]["score"] for seed in range(0, 70, 14)])
     assert found["draws"]["count"] == 70
-    assert found["success"]
+    assert not found["diverged"]
     low, high = found["draws"]["interval"]
     error = (high - low) / 2 / 1.96
     assert found["score"] == pytest.approx((low + high) / 2)
     assert error == pytest.approx(found["draws"]["std"] / np.sqrt(70))
     assert abs(found["score"] - scores.mean()) < 4 * error * np.sqrt(14)
     assert found["score"] == pytest.approx(found["criteria"]["uptime"] / 5.0)
-    assert nominal(policy, board.task).uptime.shape == (board.task.trials,)
+    assert nominal(policy, board.task).uptime.shape == (board.task.repeats,)
     c, stands = imperfect(policy, board.task, jax.random.key(1), 3)
     assert c.uptime.shape == stands.shape == (3,)
 
 
 def test_a_law_that_drives_the_passive_joint_is_refused():
     robot = "pendubot"
-    board = short(robot, seeds=3)
+    board = short(robot, draws=3)
     for judge in (official, official_run):
         with refused(f"the {robot} is driven at joint", start="the controller drives joint"):
             judge(Feedback(full_pd), board)
@@ -164,7 +166,7 @@ def test_a_recorded_run_of_the_board_is_judged():
 
 
 def test_a_task_has_room_for_its_resets():
-    assert v3("acrobot").task.trials > 1 == v2("acrobot").task.trials
+    assert v3("acrobot").task.repeats > 1 == v2("acrobot").task.repeats
     for resets in (-1, 100, 2.5):
         with refused("resets is", start=""):
             Task("acrobot", v2("acrobot").task.parameters, duration=60.0, resets=resets)
@@ -221,8 +223,41 @@ def test_the_command_judges_a_draw_and_refuses_what_the_board_has_not(monkeypatc
         "--board v3 --controller pd --hardware": "the v3 board has no normalisation",
         "--board v3 --controller pd --draws 1001": "--draws is 1001; the v3 board has 1000",
         "--controller pd --draws 2": "--draws is 2; the v2 board has 1",
+        "--board v3 --controller pd --seed 1 --draws 2": "give one of them",
+        "--board v3 --csv run.csv --seed 1": "--csv is a run that is there already",
+        "--board v3 --csv run.csv --draws 1": "leave out --draws",
         "--board v4": "board is 'v4'",
     }.items():
         code, out, err = run(line)
         assert (code, out) == (2, ""), line
         assert words in err.replace("\n", " "), err
+
+
+def test_one_draw_has_no_spread():
+    said = official(network_in(load_policy("acrobot")), short("acrobot", draws=1))
+    assert said["draws"] == {"count": 1, "std": None, "interval": None}
+
+
+def test_what_a_python_object_remembers_stays_in_a_reset():
+    """It is not called then: its calls are as many as the steps in which the arm is free."""
+
+    class Theirs:
+        def reset_(self):
+            self.calls = 0
+
+        def get_control_output_(self, x, t=None):
+            self.calls += 1
+            return [0.001 * self.calls, 0.0]
+
+    scenario = short("pendubot", duration=8.0, resets=2).drawn(0)
+    run = rollout(scenario, realaigym(Theirs()), jax.random.key(0), duration=6.0)
+    free = ~np.asarray(held(scenario.resets, np.arange(len(run.u_command))).any(axis=-1))
+    assert not free.all()
+    torque = np.asarray(run.u_command)[free, 0]
+    np.testing.assert_allclose(torque, 0.001 * np.arange(1, free.sum() + 1), rtol=1e-5)
+
+
+def test_a_gradient_is_refused_before_anything_is_trained():
+    run = TrainRun(board="v3", gradient=GradientConfig(steps=1))
+    with refused("this task has another score", start="the gradient climbs"):
+        Gradient.of(run, network_in(load_policy("pendubot")), v3("pendubot").task)

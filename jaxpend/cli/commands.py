@@ -122,19 +122,16 @@ def score(
     seed: Seed | None = None,
     draws: Count | None = None,
 ) -> None:
-    """Official score of a policy, of any other controller, or of a recorded run.
-
-    It is computed in float64; of a board on which chance plays, it is the mean of a thousand draws
-    in float32.
+    """Official score of a controller or of a recorded run, in float64 (means over draws: float32).
 
     Args:
         robot: which joint is driven: the second of the acrobot, the first of the pendubot.
-        board: v2, or v3, the one of global policies.
+        board: v2; v3, the one of global policies; or hardware, the plant of the real robots with
+            their normalisation (how many robots stand: jaxpend hardware).
         policy: a policy or controller file; by default the policy that ships with the package.
         controller: judge this instead: a known one such as tvlqr, or module:name of a
             controller, of one written for RealAIGym, or of a Python function (t, x) -> torque.
-            With a policy too: the known one around that policy, or the file of a controller of
-            your own classes.
+            With a policy too: the known one around it, or the file of your own classes.
         plant: YAML file of the parameters of another plant than that of the boards.
         design: or an identified plant by name, such as C.1/1.0.
         seed: on a board on which chance plays, judge this draw alone, in float64.
@@ -148,11 +145,12 @@ def score(
     check_file(json, JSON)
     check_file(save)
     _apart(json=json, save=save)
-    subject = Subject(robot, policy, controller, plant, design, on=board)
     from .. import boards
     from .tables import score_table
 
-    judged_on = _drawn(boards.hardware(subject.board) if hardware else subject.board, seed, save)
+    subject = Subject(robot, policy, controller, plant, design, on=board)
+    judged_on = boards.hardware(subject.board) if hardware else subject.board
+    _check_draws(judged_on, seed, draws, save, csv)
     judged_on = of_draws(judged_on, draws)
     if save is not None:
         from ..interop.csv import check_target
@@ -163,19 +161,24 @@ def score(
         result = _scored(subject, judged_on, seed, save) | about
     else:
         result, name = _recorded(csv, subject, judged_on, hardware, save), csv
+    result["board"] = judged_on.name
     if json != "-":
-        one = seed is not None or csv is not None
-        score_table({name: result}, dataclasses.replace(judged_on, seeds=1) if one else judged_on)
+        one_run = {"draws": 1} if seed is not None or csv is not None else {}
+        score_table({name: result}, dataclasses.replace(judged_on, **one_run))
     emit_json(result, json)
 
 
-def _drawn(board, seed, save):
-    """The board. Refuse options that name a draw where it has none, and a file for several."""
-    if seed is not None and board.seeds == 1:
+def _check_draws(board, seed, draws, save, csv):
+    """Refuse options that name draws where there are none, two of them, and a file for several."""
+    given = [f"--{n}" for n, v in {"seed": seed, "draws": draws}.items() if v is not None]
+    if given and csv is not None:
+        raise JaxpendError(f"--csv is a run that is there already; leave out {given[0]}")
+    if len(given) == 2:
+        raise JaxpendError("--seed is one draw and --draws are the first of them; give one of them")
+    if seed is not None and not board.task.resets:
         raise JaxpendError(f"--seed names a draw, of which the {board.name} board has none")
-    if save is not None and seed is None and board.seeds > 1:
+    if save is not None and csv is None and seed is None and board.task.resets:
         raise JaxpendError("--save writes one run; name its draw, such as --seed 0")
-    return board
 
 
 def _apart(**files):
@@ -197,6 +200,7 @@ def _scored(subject, board, seed, save):
     if save is None and seed is None:
         return official(judged, board)
     run, result = official_run(judged, board, seed or 0)
+    result |= {"seed": seed} if board.task.resets else {}
     if save is not None:
         from ..interop.csv import save_csv
 
@@ -215,7 +219,7 @@ def _recorded(csv, subject, board, hardware, save):
 
     run = load_csv(csv)
     try:
-        result = recorded(run, board, regular=not hardware)
+        result = recorded(run, board, regular=not (hardware or board.task.spread))
     except JaxpendError as error:
         raise JaxpendError(f"{csv}: {error}") from None
     return result | {"csv": csv, "plant": subject.plant, "design": subject.design}
@@ -316,7 +320,7 @@ def leaderboard(
 
     Args:
         robot: which joint is driven: the second of the acrobot, the first of the pendubot.
-        board: v2, or v3, the one of global policies, which has no robustness.
+        board: v2; or v3, of global policies, or hardware, which have no robustness benchmark.
         draws: of v3, to take the mean of; by default 1000, which takes MPC hours.
         controllers: names separated by commas; by default all that are known.
         policy: a policy or controller file to judge as well.
@@ -343,7 +347,7 @@ def leaderboard(
     chosen = boards.chosen(controllers, policy, controller, judged_on.task)
     options = {"robustness": robustness, "keys": keys, "seed": seed}
     result = boards.leaderboard(judged_on, chosen, say=say, **options)
-    result |= {"plant": plant, "design": design}
+    result |= {"board": judged_on.name, "draws": judged_on.draws, "plant": plant, "design": design}
     leaderboard_table(result, judged_on)
     emit_json(result, json)
     emit(boards.markdown(result), out)

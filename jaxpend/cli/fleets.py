@@ -47,7 +47,7 @@ def hardware(
     from .tables import hardware_table
 
     board = subject.board
-    task = dataclasses.replace(board.task, robots=PRESETS[preset])
+    task = dataclasses.replace(board.task, spread=PRESETS[preset])
     result = {"robot": robot, "preset": preset, "seed": seed} | subject.about
     judged = subject.find(board)
     with console.status("judging ...") as status:

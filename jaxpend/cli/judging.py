@@ -30,9 +30,9 @@ def of_draws(board: "Board", draws: int | None) -> "Board":
     """
     if draws is None:
         return board
-    if draws > board.seeds:
-        raise JaxpendError(f"--draws is {draws}; the {board.name} board has {board.seeds}")
-    return dataclasses.replace(board, seeds=draws)
+    if draws > board.draws:
+        raise JaxpendError(f"--draws is {draws}; the {board.name} board has {board.draws}")
+    return dataclasses.replace(board, draws=draws)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Subject:
     @property
     def name(self) -> str:
         """What it is called in a table."""
-        return self.controller or self.policy or f"shipped {self.robot}"
+        return self.controller or self.policy or f"shipped {self.board.task.shipped}"
 
     @property
     def about(self) -> dict[str, Any]:

@@ -38,7 +38,7 @@ def score_table(results: Mapping[str, Mapping], board: "Board") -> None:
     """Print results of ``score.official``, a column each, and the published scores."""
     from ..boards import HEADINGS  # loads jax
 
-    how = f"mean of {board.seeds} draws" if board.seeds > 1 else "float64"
+    how = f"mean of {board.draws} draws" if board.draws > 1 else "float64"
     table = _table("", *results, title=f"{board.robot}, {board.name}: score ({how})")
     table.add_row("score", *(Text(f"{r['score']:.4f}", "bold") for r in results.values()))
     table.add_row("success", *("yes" if r.get("success") else "no" for r in results.values()))
@@ -116,7 +116,7 @@ def leaderboard_table(result: Mapping[str, Any], board: "Board") -> None:
     # Words below one another, so that all columns fit.
     short = [f"{name}\n[{unit}]" for _, unit, _, name in map(HEADINGS.__getitem__, board.columns)]
     six = [name.replace(" ", "\n").replace("Perturbations", "Pulses") for name in CRITERIA.values()]
-    how = f"mean of {board.seeds} draws" if board.seeds > 1 else "performance (float64)"
+    how = f"mean of {board.draws} draws" if board.draws > 1 else "performance (float64)"
     parts = {how: (["score", *short], slice(0, 1 + len(short)))}
     if any(row["source"] == "measured" and row["robustness"] for row in result["rows"]):
         parts["robustness"] = ([*six, "all six"], slice(1 + len(short), None))

@@ -49,7 +49,9 @@ class PythonLaw(Memoryless):
             if self.batched:
                 u = self.law(times, states)
             else:
-                u = [self.law(float(a), b) for a, b in zip(times, states, strict=True)]
+                known = np.isfinite(states).all(axis=1)  # else it diverged, or a hand holds the arm
+                rows = zip(times, states, known, strict=True)
+                u = [self.law(float(a), b) if ok else (0.0, 0.0) for a, b, ok in rows]
             torque = _real(u)
         except JaxpendError:
             raise

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 
 from ..boards import CRITERIA
 from ..files import to_json, write_atomically
+from ..fleet import CONDITIONS
 from ..variations import VARIATIONS, Variation
 
 __all__ = [
@@ -115,8 +116,8 @@ def panel(draw: Callable[..., Any], *data: Any, **options: Any) -> Figure:
 
 def _along(axes, name: str, found: dict[str, list[float]]) -> None:
     """The share of robots that stand over one quantity, a curve for each condition."""
-    for colour, (condition, shares) in zip(("one", "two"), list(found.items())[1:], strict=True):
-        values = [100 * share for share in shares]
+    for colour, condition in zip(("one", "two"), CONDITIONS, strict=True):
+        values = [100 * share for share in found[condition]]
         axes.plot(found["values"], values, "o-", color=PALETTE[colour], label=condition)
     axes.set(title=name, ylim=(-3, 103), ylabel="stand [%]")
 
@@ -131,7 +132,7 @@ def write_hardware(result: dict[str, Any], folder: Path) -> Path:
     title = f"{result['robot']}: robots that stand, {result['preset']}"
     figure = stack(draws, columns=4, size=(3.2, 2.4), title=title)
     figure.axes[0].legend()
-    path = folder / f"hardware_{result['robot']}.png"
+    path = folder / f"{result['preset']}_{result['robot']}.png"
     folder.mkdir(parents=True, exist_ok=True)
     save(figure, path)
     write_atomically(path.with_suffix(".json"), to_json(result, indent=2) + "\n")

@@ -37,8 +37,9 @@ class Judged:
 
     @property
     def up(self) -> float | None:
-        """Swing-up time, s; None without success."""
-        return self.criteria["swingup_time"] if self.success else None
+        """Swing-up time, s; None without success, and where resets follow it."""
+        stands = self.success and not self.task.resets
+        return self.criteria["swingup_time"] if stands else None
 
     @property
     def robustness(self) -> float | None:
@@ -58,6 +59,8 @@ class Judged:
     @property
     def window(self) -> float:
         """How much of the run shows its swing-up, whole seconds."""
+        if self.task.resets:
+            return min(self.whole, 10.0)
         if self.up is None:
             return self.whole
         return min(self.whole, max(3.0, float(round(2.5 * self.up))))
@@ -85,7 +88,7 @@ def judge(
     with jax.enable_x64(True):
         trajectory, said = official_run(found(), board)
         points = jax.vmap(forward_kinematics, (None, 0))(task.plant, trajectory.x)
-    if board.seeds > 1:
+    if board.draws > 1:
         said = official(found(), board)
     if robustness and board.trials is not None:
         report = {"robot": run.robot} | benchmark(found(), board, jax.random.key(0)).as_dict()

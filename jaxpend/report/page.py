@@ -127,8 +127,8 @@ def _seconds(run: RunRecord) -> float:
 
 def _board(run: RunRecord) -> Board:
     """The board of a run; of a run on a plant of its own, on that, and unpublished."""
-    plant, name = run.made_by.get("plant"), run.config.get("board") or "v2"
-    official = boards.named_board(run.robot, name)
+    plant, on = run.made_by.get("plant"), run.config.get("board") or run.made_by.get("board")
+    official = boards.named_board(run.robot, on if on in boards.BOARDS else "v2")
     if not plant or plant == dict(official.task.parameters):
         return official
     name = run.config.get("plant") or run.config.get("design") or "a plant of its own"
@@ -157,7 +157,7 @@ def write(
         folder: to write into.
         title: name of the run, or of the folder of seeds.
         robustness: run the benchmark for every seed; what is reported is the median over keys.
-        board: to judge on; by default the v2 board of the runs' robot.
+        board: to judge on; by default the runs' own.
         controller: judged with the runs' policies, or instead of them; as in ``judge``.
 
     Returns:

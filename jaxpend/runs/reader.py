@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import JaxpendError
-from ..robots import ROBOTS
+from ..robots import ROBOTS, SHIPPED
 
 __all__ = [
     "RunRecord", "StageRecord", "Unreadable", "find", "listing", "read_json", "read_result",
@@ -245,8 +245,12 @@ def find(run: Path) -> list[RunRecord]:
         return [read_run(seed) for seed in seeds]
     if (run / "config.json").exists():
         return [read_run(run)]
-    if run.is_file() or (str(run) in ROBOTS and not run.exists()):
-        return [RunRecord(run.stem, read_header(run)["robot"], {}, (), [], None, str(run))]
+    if run.is_file() or (str(run) in SHIPPED and not run.exists()):
+        header = read_header(run)
+        made_for = header.get("provenance", {}).get("config")
+        board = made_for.get("board") if isinstance(made_for, dict) else None
+        record = RunRecord(run.stem, header["robot"], {}, (), [], None, str(run))
+        return [dataclasses.replace(record, made_by={"board": board} if board else {})]
     raise JaxpendError(
         f"{run} is not a run: give a folder that training has left (with config.json), a folder "
         f"of seeds, a policy file, or {' or '.join(ROBOTS)} for the policy that ships"
