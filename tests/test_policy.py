@@ -12,10 +12,12 @@ from conftest import assert_close, both_robots, refused, rewrite
 
 from jaxpend import JaxpendError, Policy, load_policy, save_policy
 from jaxpend.boards import v2
+from jaxpend.controller import robot_of
 from jaxpend.controllers.files import read_header
 from jaxpend.designs import active_joint
 from jaxpend.env import Env, EnvConfig
 from jaxpend.observation import Observation
+from jaxpend.robots import SHIPPED
 from jaxpend.rollout import rollout
 
 KEY = jax.random.key(0)
@@ -286,3 +288,12 @@ def test_an_unknown_way_to_squash_is_refused(tmp_path):
     rewrite(path, lambda _, header: header["controller"]["fields"].update(squash="sine"))
     with refused("unknown squash 'sine'; known: tanh, clip", start=str(path)):
         load_policy(path)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_policy_that_ships_is_one_of_its_robot(name):
+    policy = load_policy(name)
+    assert robot_of(policy) == name.rpartition("_")[2]
+    command = read_header(name)["provenance"]["command"]
+    assert command.startswith("jaxpend")
+    assert "/tmp" not in command
