@@ -10,7 +10,7 @@ __all__ = ["ROBOTS", "SHIPPED", "active_joint", "shipped"]
 # Driven joint of each robot.
 ROBOTS = {"acrobot": 1, "pendubot": 0}
 # Policies that ship: those of the v2 boards by the robot's name, and those of other tasks.
-SHIPPED = (*ROBOTS, *(f"global_{robot}" for robot in ROBOTS), "hardware_pendubot")
+SHIPPED = (*ROBOTS, *(f"{task}_{robot}" for task in ("global", "hardware") for robot in ROBOTS))
 
 
 def active_joint(robot: str) -> int:

@@ -163,8 +163,8 @@ def score(
         result, name = _recorded(csv, subject, judged_on, hardware, save), csv
     result["board"] = judged_on.name
     if json != "-":
-        one_run = {"draws": 1} if seed is not None or csv is not None else {}
-        score_table({name: result}, dataclasses.replace(judged_on, **one_run))
+        shown = 1 if seed is not None or csv is not None else judged_on.draws
+        score_table({name: result}, dataclasses.replace(judged_on, draws=shown))
     emit_json(result, json)
 
 
