@@ -230,7 +230,7 @@ def place(template, tmp_path, monkeypatch):
 @pytest.mark.parametrize(("line", "words"), CASES, ids=[str(line) for line, _ in CASES])
 def test_what_is_hostile_is_refused(place, monkeypatch, capsys, line, words):
     computed = []
-    for name in ("score.nominal", "robustness.benchmark", "train.loop.train_group"):
+    for name in ("score.trial_run", "robustness.benchmark", "train.loop.train_group"):
         monkeypatch.setattr(f"jaxpend.{name}", lambda *_, **__: computed.append(1) or {}[""])
     words_of_line = line if isinstance(line, list) else line.split()
     monkeypatch.setattr("sys.argv", ["jaxpend", *words_of_line])
