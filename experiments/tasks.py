@@ -31,7 +31,7 @@ THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 def command(*words: str, **kwargs: Any) -> str:
     """Standard output of ``jaxpend``."""
     line = [sys.executable, "-m", "jaxpend", *words]
-    return subprocess.run(line, capture_output=True, text=True, check=True, **kwargs).stdout
+    return subprocess.run(line, stdout=subprocess.PIPE, text=True, check=True, **kwargs).stdout
 
 
 def fleet(robot: str, policy: Path) -> dict:
@@ -46,15 +46,8 @@ def fleet(robot: str, policy: Path) -> dict:
 def others() -> None:
     """Print tables in Markdown of the controllers that were not trained for these tasks."""
     for robot in ROBOTS:
-        line = (
-            "leaderboard",
-            "--board",
-            "v3",
-            "--robot",
-            robot,
-            "--controllers",
-            ",".join(CLASSICAL),
-        )
+        classical = ("--controllers", ",".join(CLASSICAL))
+        line = ("leaderboard", "--board", "v3", "--robot", robot, *classical)
         print(command(*line, "--policy", robot, "--draws", "100", "--out", "-"))
     for robot in ROBOTS:
         for name, options in {robot: ("--policy", robot)} | {

@@ -39,12 +39,8 @@ class Spread:
     pushes: int = 2  # on each joint in a run
 
     def __post_init__(self) -> None:
-        for name, most in {
-            "inertial": 1.0,
-            "friction": 1.0,
-            "response": 1.0,
-            "delay": LONGEST,
-        }.items():
+        most_of = {"inertial": 1.0, "friction": 1.0, "response": 1.0, "delay": LONGEST}
+        for name, most in most_of.items():
             if not 0 <= getattr(self, name) <= most:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be in 0 to {most:g}")
         if not self.inertial < 1:
