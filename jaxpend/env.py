@@ -18,11 +18,19 @@ import numpy as np
 
 from .boards import Task
 from .config import LINES, EnvConfig, Reward
-from .plant import Plant, forward_kinematics, kinetic_energy, potential_energy, rk4_step
+from .plant import (
+    Plant,
+    forward_kinematics,
+    joint_torque,
+    kinetic_energy,
+    potential_energy,
+    rk4_step,
+)
 from .pytree import Pytree, pytree
 from .resets import thrown
 from .rollout import SLOTS, Sensors, actuate, draws, measure, sensors
 from .scenario import DT, Scenario
+from .trigonometry import sincos
 
 __all__ = [
     "Env",
@@ -52,7 +60,7 @@ def surrogate_reward(plant: Plant, reward: Reward, line: float, x, action, befor
     height = forward_kinematics(plant, x)[1, 1]
     potential, kinetic = potential_energy(plant, x), kinetic_energy(plant, x)
     effort, change = action**2, jnp.abs(action - before)
-    straight = (1 + jnp.cos(x[1])) ** 2
+    straight = (1 + sincos(x[1])[1]) ** 2
     above = reward.alpha * straight - reward.beta * kinetic
     above = above - reward.rho1 * effort - reward.phi1 * change
     below = -reward.rho2 * effort - reward.phi2 * change - reward.eta * (x[2] ** 2 + x[3] ** 2)
@@ -179,7 +187,7 @@ class Env:
         if past is not None:
             seen = x if world is None else world.measured
             past = jnp.concatenate([jnp.append(seen, a)[None], past[:-1]])
-        torque = jnp.where(jnp.arange(2) == self.task.joint, self.config.torque_limit * a, 0.0)
+        torque = joint_torque(self.config.torque_limit * a, self.task.joint)
         if world is None:
             x = rk4_step(self.plant, x, torque, self.config.dt)
         else:

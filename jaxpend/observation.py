@@ -29,8 +29,10 @@ def _sincos(x: jax.Array, max_velocity: float) -> jax.Array:
     """Cosine and sine of both angles and scaled velocities: no jump anywhere."""
     import jax.numpy as jnp
 
-    angles, velocity = x[:2], x[2:4]
-    return jnp.concatenate([jnp.cos(angles), jnp.sin(angles), velocity / max_velocity])
+    from .trigonometry import sincos
+
+    sin, cos = sincos(x[:2])
+    return jnp.concatenate([cos, sin, x[2:4] / max_velocity])
 
 
 def _clipped(x: jax.Array, max_velocity: float) -> jax.Array:

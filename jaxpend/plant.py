@@ -20,11 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .pytree import Pytree, pytree
+from .trigonometry import arctan, sincos
 
 __all__ = [
     "UPRIGHT", "Plant", "coriolis_matrix", "deviation", "dynamics", "euler_step",
-    "forward_kinematics", "friction_vector", "gravity_vector", "kinetic_energy", "linearize",
-    "mass_matrix", "potential_energy", "rk4_step", "tip_height", "total_energy",
+    "forward_kinematics", "friction_vector", "gravity_vector", "joint_torque", "kinetic_energy",
+    "linearize", "mass_matrix", "potential_energy", "rk4_step", "tip_height", "total_energy",
 ]  # fmt: skip
 
 UPRIGHT = (np.pi, 0.0, 0.0, 0.0)
@@ -49,10 +50,15 @@ class Plant(Pytree):
     gear_ratio: jax.Array  # ()
 
 
-def _mass_terms(plant: Plant, theta2: jax.Array):
+def _sines(x: jax.Array) -> tuple[jax.Array, ...]:
+    """Sine and cosine of ``theta1``, then those of ``theta1 + theta2``."""
+    return *sincos(x[0]), *sincos(x[0] + x[1])
+
+
+def _mass_terms(plant: Plant, cos2: jax.Array):
     """The three distinct entries ``(m11, m12, m22)`` of the mass matrix."""
     m2l1 = plant.mass[1] * plant.length[0]
-    coupling = m2l1 * plant.com[1] * jnp.cos(theta2)
+    coupling = m2l1 * plant.com[1] * cos2
     ir, gr = plant.motor_inertia, plant.gear_ratio
     m11 = plant.inertia[0] + plant.inertia[1] + m2l1 * plant.length[0] + 2 * coupling
     m11 = m11 + gr**2 * ir + ir
@@ -63,51 +69,55 @@ def _mass_terms(plant: Plant, theta2: jax.Array):
 
 def mass_matrix(plant: Plant, x: jax.Array) -> jax.Array:
     """Mass matrix ``M(theta)``, shape (2, 2), kg m^2, for a state of shape (4,)."""
-    m11, m12, m22 = _mass_terms(plant, x[1])
+    m11, m12, m22 = _mass_terms(plant, sincos(x[1])[1])
     return jnp.stack([jnp.stack([m11, m12]), jnp.stack([m12, m22])])
 
 
 def coriolis_matrix(plant: Plant, x: jax.Array) -> jax.Array:
     """Coriolis and centrifugal matrix ``C(theta, omega)``, shape (2, 2), N m s/rad."""
-    h = plant.mass[1] * plant.length[0] * plant.com[1] * jnp.sin(x[1])
+    h = plant.mass[1] * plant.length[0] * plant.com[1] * sincos(x[1])[0]
     first, second = [-2 * h * x[3], -h * x[3]], [h * x[2], jnp.zeros_like(h)]
     return jnp.stack([jnp.stack(first), jnp.stack(second)])
 
 
+def _gravity_terms(plant: Plant, sin1: jax.Array, sin12: jax.Array):
+    """Both gravity torques, of the sines of ``theta1`` and ``theta1 + theta2``."""
+    m, g = plant.mass, plant.gravity
+    g2 = -m[1] * g * plant.com[1] * sin12
+    return -(m[0] * plant.com[0] + m[1] * plant.length[0]) * g * sin1 + g2, g2
+
+
 def gravity_vector(plant: Plant, x: jax.Array) -> jax.Array:
     """Gravity torque ``G(theta)`` on the right-hand side, shape (2,), N m."""
-    m, g = plant.mass, plant.gravity
-    g2 = -m[1] * g * plant.com[1] * jnp.sin(x[0] + x[1])
-    g1 = -(m[0] * plant.com[0] + m[1] * plant.length[0]) * g * jnp.sin(x[0]) + g2
-    return jnp.stack([g1, g2])
+    sin1, _, sin12, _ = _sines(x)
+    return jnp.stack(_gravity_terms(plant, sin1, sin12))
 
 
-def _arctan(x: jax.Array) -> jax.Array:
-    """``arctan``; in float32 to 1.4e-7 by one division and a short polynomial.
-
-    XLA's own took three quarters of the time of a float32 step on a CPU. The reduction to
-    [0, tan(pi/8)] and the coefficients are those of Moshier's Cephes library (``atanf``).
-    """
-    if jnp.result_type(x) != jnp.float32:
-        return jnp.arctan(x)
-    a = jnp.abs(x)
-    middle, far = a > 0.41421356, a > 2.41421356
-    numerator = jnp.where(far, -1.0, jnp.where(middle, a - 1.0, a))
-    r = numerator / jnp.where(far, a, jnp.where(middle, a + 1.0, 1.0))
-    offset = jnp.where(far, jnp.pi / 2, jnp.where(middle, jnp.pi / 4, 0.0))
-    z = r * r
-    p = ((8.05374449538e-2 * z - 1.38776856032e-1) * z + 1.99777106478e-1) * z - 3.33329491539e-1
-    y = offset + (p * z * r + r)
-    return jnp.where(x < 0, -y, y)
+def _friction(plant: Plant, joint: int, omega: jax.Array) -> jax.Array:
+    """Friction torque of a joint."""
+    viscous, coulomb = plant.damping[joint] * omega, plant.coulomb_friction
+    known = not isinstance(coulomb, jax.core.Tracer)
+    if coulomb is None or (known and not np.asarray(coulomb).any()):
+        return viscous  # the arctan is much of the cost of a step
+    return viscous + coulomb[joint] * arctan(COULOMB_STEEPNESS * omega)
 
 
 def friction_vector(plant: Plant, x: jax.Array) -> jax.Array:
     """Friction torque ``F(omega) = b omega + c arctan(100 omega)``, shape (2,), N m."""
-    viscous, coulomb = plant.damping * x[2:4], plant.coulomb_friction
-    known = not isinstance(coulomb, jax.core.Tracer)
-    if coulomb is None or (known and not np.asarray(coulomb).any()):
-        return viscous  # the arctan is most of the cost of a step
-    return viscous + coulomb * _arctan(COULOMB_STEEPNESS * x[2:4])
+    return jnp.stack([_friction(plant, 0, x[2]), _friction(plant, 1, x[3])])
+
+
+def _accelerations(plant: Plant, theta1, theta2, omega1, omega2, u):
+    """Both entries of ``alpha``. Sines and cosines are taken once."""
+    (sin1, cos1), (sin2, cos2) = sincos(theta1), sincos(theta2)
+    m11, m12, m22 = _mass_terms(plant, cos2)
+    g1, g2 = _gravity_terms(plant, sin1, sin1 * cos2 + cos1 * sin2)
+    h = plant.mass[1] * plant.length[0] * plant.com[1] * sin2
+    f1 = g1 + plant.actuation[0] * u[0] + h * omega2 * (2 * omega1 + omega2)
+    f2 = g2 + plant.actuation[1] * u[1] - h * omega1 * omega1
+    f1, f2 = f1 - _friction(plant, 0, omega1), f2 - _friction(plant, 1, omega2)
+    det = m11 * m22 - m12 * m12
+    return (m22 * f1 - m12 * f2) / det, (m11 * f2 - m12 * f1) / det
 
 
 def dynamics(plant: Plant, x: jax.Array, u: jax.Array) -> jax.Array:
@@ -115,28 +125,29 @@ def dynamics(plant: Plant, x: jax.Array, u: jax.Array) -> jax.Array:
 
     ``alpha = M^-1 (G + B u - C omega - F)``. The torque is not clipped here.
     """
-    m11, m12, m22 = _mass_terms(plant, x[1])
-    gravity, friction = gravity_vector(plant, x), friction_vector(plant, x)
-    omega1, omega2 = x[2], x[3]
-    h = plant.mass[1] * plant.length[0] * plant.com[1] * jnp.sin(x[1])
-    f1 = gravity[0] + plant.actuation[0] * u[0] + h * omega2 * (2 * omega1 + omega2) - friction[0]
-    f2 = gravity[1] + plant.actuation[1] * u[1] - h * omega1 * omega1 - friction[1]
-    det = m11 * m22 - m12 * m12
-    alpha1 = (m22 * f1 - m12 * f2) / det
-    alpha2 = (m11 * f2 - m12 * f1) / det
-    return jnp.stack([omega1, omega2, alpha1, alpha2])
+    return jnp.stack([x[2], x[3], *_accelerations(plant, x[0], x[1], x[2], x[3], u)])
+
+
+def joint_torque(torque: jax.Array, joint: int) -> jax.Array:
+    """Torques (..., 2) of a torque (...) on a joint, 0 or 1, and none on the other.
+
+    Put together of two entries: a batch stays fast on a CPU then, unlike by a mask (``rk4_step``).
+    """
+    none = jnp.zeros_like(torque)
+    return jnp.stack([none, torque] if joint else [torque, none], axis=-1)
 
 
 def kinetic_energy(plant: Plant, x: jax.Array) -> jax.Array:
     """Kinetic energy ``omega' M omega / 2``, scalar, J."""
-    m11, m12, m22 = _mass_terms(plant, x[1])
+    m11, m12, m22 = _mass_terms(plant, sincos(x[1])[1])
     return 0.5 * (m11 * x[2] ** 2 + 2 * m12 * x[2] * x[3] + m22 * x[3] ** 2)
 
 
 def potential_energy(plant: Plant, x: jax.Array) -> jax.Array:
     """Potential energy, scalar, J, zero at the height of joint 1."""
-    y1 = -plant.com[0] * jnp.cos(x[0])
-    y2 = -plant.length[0] * jnp.cos(x[0]) - plant.com[1] * jnp.cos(x[0] + x[1])
+    _, cos1, _, cos12 = _sines(x)
+    y1 = -plant.com[0] * cos1
+    y2 = -plant.length[0] * cos1 - plant.com[1] * cos12
     return plant.gravity * (plant.mass[0] * y1 + plant.mass[1] * y2)
 
 
@@ -147,16 +158,15 @@ def total_energy(plant: Plant, x: jax.Array) -> jax.Array:
 
 def forward_kinematics(plant: Plant, x: jax.Array) -> jax.Array:
     """Positions of elbow and end effector, shape (2, 2) = [link][x, y], m, joint 1 at (0, 0)."""
-    elbow_x = plant.length[0] * jnp.sin(x[0])
-    elbow_y = -plant.length[0] * jnp.cos(x[0])
-    end_x = elbow_x + plant.length[1] * jnp.sin(x[0] + x[1])
-    end_y = elbow_y - plant.length[1] * jnp.cos(x[0] + x[1])
+    sin1, cos1, sin12, cos12 = _sines(x)
+    elbow_x, elbow_y = plant.length[0] * sin1, -plant.length[0] * cos1
+    end_x, end_y = elbow_x + plant.length[1] * sin12, elbow_y - plant.length[1] * cos12
     return jnp.stack([jnp.stack([elbow_x, elbow_y]), jnp.stack([end_x, end_y])])
 
 
 def tip_height(length: jax.Array, x: jax.Array) -> jax.Array:
     """Height of the end effector above joint 1, m, of states (..., 4): shape (...)."""
-    return -length[0] * jnp.cos(x[..., 0]) - length[1] * jnp.cos(x[..., 0] + x[..., 1])
+    return -length[0] * sincos(x[..., 0])[1] - length[1] * sincos(x[..., 0] + x[..., 1])[1]
 
 
 def deviation(x: jax.Array, goal: jax.Array) -> jax.Array:
@@ -176,14 +186,25 @@ def euler_step(plant: Plant, x: jax.Array, u: jax.Array, dt: float) -> jax.Array
 
 
 def rk4_step(plant: Plant, x: jax.Array, u: jax.Array, dt: float) -> jax.Array:
-    """State after ``dt`` seconds by the classical fourth-order Runge-Kutta rule, torque held."""
+    """State after ``dt`` seconds by the classical fourth-order Runge-Kutta rule, torque held.
 
-    def slope(x):
+    The four entries of the state are apart from each other up to the end: of a batch each is one
+    contiguous vector then, which a CPU works on many entries at a time.
+    """
+    start = x[0], x[1], x[2], x[3]
+
+    def slope(parts):
+        theta1, theta2, omega1, omega2 = parts
+        alpha = _accelerations(plant, theta1, theta2, omega1, omega2, u)
         # Keeps XLA from fusing the stages into one kernel, which recomputes the earlier ones.
-        return jax.lax.optimization_barrier(dynamics(plant, x, u))
+        return omega1, omega2, *jax.lax.optimization_barrier(alpha)
 
-    k1 = slope(x)
-    k2 = slope(x + 0.5 * dt * k1)
-    k3 = slope(x + 0.5 * dt * k2)
-    k4 = slope(x + dt * k3)
-    return x + dt / 6 * (k1 + 2 * (k2 + k3) + k4)
+    def ahead(time, k):
+        return tuple(p + time * s for p, s in zip(start, k, strict=True))
+
+    k1 = slope(start)
+    k2 = slope(ahead(0.5 * dt, k1))
+    k3 = slope(ahead(0.5 * dt, k2))
+    k4 = slope(ahead(dt, k3))
+    slopes = zip(start, k1, k2, k3, k4, strict=True)
+    return jnp.stack([p + dt / 6 * (a + 2 * (b + c) + d) for p, a, b, c, d in slopes])

@@ -102,13 +102,15 @@ def measure(scenario: Scenario, sensors: Sensors, k, x, z, dt):
 
 def actuate(scenario: Scenario, command, applied_before, t_pulse, z):
     """Torque that reaches the joints: response, noise, limit, disturbance, in this order."""
-    u = command
-    if scenario.responsiveness is not None:
-        u = applied_before + scenario.responsiveness * (u - applied_before)
-    if scenario.torque_noise is not None:
-        u = u + scenario.torque_noise * z["torque_noise"]
-    limit = scenario.plant.torque_limit
-    u = jnp.clip(u, -limit, limit)
+    limit, torques = scenario.plant.torque_limit, []
+    for joint in range(2):  # apart from each other, as in ``plant.joint_torque``
+        u = command[joint]
+        if scenario.responsiveness is not None:
+            u = applied_before[joint] + scenario.responsiveness * (u - applied_before[joint])
+        if scenario.torque_noise is not None:
+            u = u + scenario.torque_noise[joint] * z["torque_noise"][joint]
+        torques.append(jnp.clip(u, -limit[joint], limit[joint]))
+    u = jnp.stack(torques)
     return u if scenario.pulses is None else u + scenario.pulses.torque(t_pulse)
 
 
@@ -131,7 +133,8 @@ def _closed_loop(
     }
 
     def step(carry, now):
-        x, u, memory, hand, sensed = carry
+        parts, u, memory, hand, sensed = carry
+        x = jnp.stack(parts)
         sensed, measured = measure(scenario, sensed, now["k"], x, now["z"], dt)
         seen = measured
         if scenario.resets is not None:
@@ -150,13 +153,15 @@ def _closed_loop(
         x_next = integrator(plant, x, u, dt)
         if scenario.process_noise is not None:
             x_next = x_next + scenario.process_noise * now["z"]["process_noise"]
-        carry = x_next, u, after, hand, sensed
+        carry = tuple(x_next), u, after, hand, sensed
         return carry, (x, u, measured, command) if record else None
 
     sensed = sensors(scenario, x0, delay_slots)
     hand = None if scenario.resets is None else begun(dtype)
-    start = (x0, jnp.zeros(2, dtype), controller.reset(controller_key), hand, sensed)
-    (x_end, *_), recorded = jax.lax.scan(step, start, inputs)
+    # The entries of the state are apart, as in ``rk4_step``.
+    start = (tuple(x0), jnp.zeros(2, dtype), controller.reset(controller_key), hand, sensed)
+    (parts, *_), recorded = jax.lax.scan(step, start, inputs)
+    x_end = jnp.stack(parts)
     if not record:
         return x_end
     x, u, measured, command = recorded

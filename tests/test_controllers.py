@@ -163,7 +163,7 @@ def test_shipped_swing_up_obeys_the_equations_of_motion():
     found = reference("acrobot")
     plant = designs.competition("acrobot")
     step = jax.jit(jax.vmap(lambda x, u: rk4_step(plant, x, u, found.dt)))
-    torques = found.both(found.u[:, None])
+    torques = found.both(found.u)
     np.testing.assert_allclose(step(found.x[:-1], torques), found.x[1:], atol=2e-6)
     np.testing.assert_allclose(found.x[0], 0.0)
     np.testing.assert_allclose(found.x[-1], found.goal, atol=1e-2)
@@ -172,7 +172,7 @@ def test_shipped_swing_up_obeys_the_equations_of_motion():
 def test_tvlqr_rejects_what_open_loop_does_not_and_vmap_is_a_loop():
     plant, found = designs.competition("acrobot"), reference("acrobot")
     tracking = tvlqr(plant, found)
-    playing = OpenLoop(found.dt * (jnp.arange(found.steps) - 0.5), found.both(found.u[:, None]))
+    playing = OpenLoop(found.dt * (jnp.arange(found.steps) - 0.5), found.both(found.u))
     x0 = 0.02 * jnp.array([[1.0, 0, 0, 0], [0, -1.0, 1.0, 0], [0, 0, 0, 2.0]])
 
     @jax.jit

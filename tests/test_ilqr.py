@@ -151,7 +151,7 @@ def test_smooth_score_approaches_the_official_one():
     totals = jnp.sum(features(p, jnp.arange(reference.steps), z, reference.u), axis=0)
     t = reference.dt * jnp.arange(reference.steps)
     found = criteria(
-        t, reference.x[:-1], reference.both(reference.u[:, None]), p.plant, t_final=float(t[-1])
+        t, reference.x[:-1], reference.both(reference.u), p.plant, t_final=float(t[-1])
     )
     names = ("swingup_time", "energy", "tau_cost", "velocity_cost")
     expected = [float(getattr(found, name)) for name in names]

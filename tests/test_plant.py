@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from jaxpend import plant as physics
 from jaxpend.designs import available, load
+from jaxpend.trigonometry import arctan, sincos
 
 DT = 0.002
 EVALUATED = {
@@ -197,10 +198,22 @@ def test_jitted_and_batched_steps_are_the_plain_ones():
     assert_close(batched[np.array(rows)], plain)
 
 
+def test_fast_sine_and_cosine_of_single_precision():
+    x = np.concatenate([np.linspace(-9, 9, 5001), np.linspace(-8000, 8000, 99_999)]).astype("f4")
+    for found, exact in zip(sincos(x), (np.sin, np.cos), strict=True):
+        np.testing.assert_allclose(found, exact(x.astype(float)), atol=1e-7)
+    slopes = jax.vmap(jax.jacfwd(sincos))(x[:5001])
+    np.testing.assert_allclose(slopes[0], np.cos(x[:5001].astype(float)), atol=2e-6)
+    np.testing.assert_allclose(slopes[1], -np.sin(x[:5001].astype(float)), atol=2e-6)
+    # Of a diverged arm: bounded, and not a number where there is none.
+    assert np.abs(sincos(np.float32([1e9, -1e30, 3e38]))).max() <= 1
+    assert np.isnan(sincos(np.float32([np.nan, np.inf]))).all()
+
+
 def test_fast_arctan_of_single_precision():
     x = np.concatenate([np.linspace(-6, 6, 5001), [0.0, np.inf, -np.inf], np.logspace(-9, 9, 99)])
     x = x.astype("f4")
-    np.testing.assert_allclose(physics._arctan(x), np.arctan(x.astype(float)), atol=2e-7)
-    slope = jax.vmap(jax.grad(physics._arctan))(x[:5001])
+    np.testing.assert_allclose(arctan(x), np.arctan(x.astype(float)), atol=2e-7)
+    slope = jax.vmap(jax.grad(arctan))(x[:5001])
     np.testing.assert_allclose(slope, 1 / (1 + x[:5001].astype(float) ** 2), atol=2e-6)
-    assert np.isnan(physics._arctan(np.float32(np.nan)))
+    assert np.isnan(arctan(np.float32(np.nan)))

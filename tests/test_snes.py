@@ -101,6 +101,18 @@ def test_best_individual_is_the_one_with_the_best_fitness_so_far(toy_fitness):
     assert distance(best) < 1.1 * distance(TOY)
 
 
+def test_groups_change_nothing(toy_fitness, monkeypatch):
+    """Large networks are judged a few at a time, so that their weights stay near."""
+    assert [snes._group(40, size) for size in (100, 17_000, 67_000, 10**9)] == [40, 40, 10, 1]
+    assert snes._group(7, 200_000) == 1
+    config = SNESConfig(generations=3, population=6)
+    at_once, _ = evolved(config, TOY, 3)
+    monkeypatch.setattr(snes, "NEAR", 4 * 25 * 2.5)  # two networks of 25 numbers
+    snes.evolve.clear_cache()
+    assert snes._group(6, 25) == 2
+    jax.tree.map(assert_close, evolved(config, TOY, 3)[0].strategy.mean, at_once.strategy.mean)
+
+
 def test_only_what_is_searched_changes(toy_fitness):
     for searched in ("all", "hidden"):
         config = SNESConfig(generations=3, population=4, searched=searched)

@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parents[1] / "jaxpend"
 # From the bottom up. A name stands for the modules in it that are not named apart. Modules of one
 # line may import each other, as long as there is no circle.
 LAYERS = """
-errors files arrays robots pytree fields observation config config_files terminal
+errors files arrays robots pytree fields trigonometry observation config config_files terminal
 plant
 designs resets
 scenario

@@ -46,7 +46,7 @@ def _network(plant: Plant, robot: str, policy: str) -> Controller:
 
 def _open_loop(plant: Plant, robot: str, policy: str) -> Controller:
     reference = load_reference(robot)
-    torques = reference.both(reference.u[:, None])
+    torques = reference.both(reference.u)
     # Half a step early, so that rounding in the sum of time steps does not matter.
     return OpenLoop(reference.dt * (jnp.arange(reference.steps) - 0.5), torques)
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..designs import active_joint
 from ..errors import JaxpendError
-from ..plant import Plant, deviation
+from ..plant import Plant, deviation, joint_torque
 from ..pytree import pytree, static
 from ..scenario import DT
 from ..stepping import Startable
@@ -147,7 +147,7 @@ class MPC(Startable):
         # batch.
         torque = jnp.nan_to_num(u + plan.gain[since] @ error)
         torque = jnp.clip(torque, -limit, limit).astype(last.dtype)
-        return (plan, torque), jnp.where(np.arange(2) == self.joint, torque, 0.0)
+        return (plan, torque), joint_torque(torque, self.joint)
 
 
 def tracking_mpc(

@@ -6,12 +6,12 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from .. import config
 from ..designs import active_joint
 from ..errors import JaxpendError
 from ..observation import Observation
+from ..plant import joint_torque
 from ..pytree import Pytree, pytree, static
 from ..stepping import Startable
 from .search_space import WEIGHT
@@ -116,8 +116,8 @@ class Policy(Startable):
         action = SQUASHES[self.squash](pre)
         if memory is not None:
             memory = memory.after(t, x, action)
-        torque, driven = self.torque_limit * action, np.arange(2) == active_joint(self.robot)
-        return (key, memory), jnp.where(driven, torque, jnp.zeros_like(torque))
+        torque = joint_torque(self.torque_limit * action, active_joint(self.robot))
+        return (key, memory), torque
 
 
 def _is_policy(part: Any) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import read_arrays, write_arrays
 from ..errors import JaxpendError, choose
+from ..plant import joint_torque
 from ..pytree import Pytree, pytree, static
 from ..robots import ROBOTS, active_joint, shipped
 from ..scenario import DT
@@ -46,8 +47,8 @@ class Reference(Pytree):
         return jnp.clip(index, 0, self.steps - 1), index < self.steps
 
     def both(self, torque: jax.Array) -> jax.Array:
-        """A torque of the driven joint () as torques of both joints (2,)."""
-        return jnp.where(np.arange(2) == active_joint(self.robot), torque, jnp.zeros_like(torque))
+        """Torques of the driven joint (...) as torques of both joints (..., 2)."""
+        return joint_torque(torque, active_joint(self.robot))
 
 
 def save_reference(path: str | Path, reference: Reference, provenance: dict[str, Any]) -> None:

@@ -18,12 +18,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from ..boards import Task
 from ..criteria import ScoreV2
 from ..errors import JaxpendError
-from ..plant import Plant, forward_kinematics, rk4_step
+from ..plant import Plant, forward_kinematics, joint_torque, rk4_step
 from ..pytree import Pytree, pytree, static
 from .ilqr import Problem
 
@@ -52,7 +51,7 @@ class SwingUp(Pytree):
 
 def step(p, z: jax.Array, u: jax.Array) -> jax.Array:
     """``z`` (5,) after one step of ``p.dt`` of ``p.plant`` under torque ``u`` of ``p.joint``."""
-    torque = jnp.where(np.arange(2) == p.joint, u, jnp.zeros_like(u))
+    torque = joint_torque(u, p.joint)
     return jnp.concatenate([rk4_step(p.plant, z[:4], torque, p.dt), u[None]])
 
 
