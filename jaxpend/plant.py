@@ -15,9 +15,12 @@ The 2x2 algebra is written out element by element: XLA fuses it, and no device r
 rounds matrix products.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 from .pytree import Pytree, pytree
 from .trigonometry import arctan, sincos
@@ -186,18 +189,39 @@ def euler_step(plant: Plant, x: jax.Array, u: jax.Array, dt: float) -> jax.Array
 
 
 def rk4_step(plant: Plant, x: jax.Array, u: jax.Array, dt: float) -> jax.Array:
-    """State after ``dt`` seconds by the classical fourth-order Runge-Kutta rule, torque held.
+    """State after ``dt`` seconds by the classical fourth-order Runge-Kutta rule, torque held."""
+    friction = plant.coulomb_friction
+    if not isinstance(friction, jax.core.Tracer | None) and not np.asarray(friction).any():
+        plant = plant.replace(coulomb_friction=None)  # inside, one cannot see that it is zero
+    return _rk4_step(plant, x, u, dt)
 
-    The four entries of the state are apart from each other up to the end: of a batch each is one
-    contiguous vector then, which a CPU works on many entries at a time.
+
+@jax.custom_jvp
+def _rk4_step(plant, x, u, dt):
+    """The step with the four entries of the state apart from each other up to the end.
+
+    Of a batch each is one contiguous vector then, which a CPU works on many entries at a time.
     """
-    start = x[0], x[1], x[2], x[3]
 
     def slope(parts):
         theta1, theta2, omega1, omega2 = parts
-        alpha = _accelerations(plant, theta1, theta2, omega1, omega2, u)
+        return omega1, omega2, *_accelerations(plant, theta1, theta2, omega1, omega2, u)
+
+    return jnp.stack(_runge_kutta(slope, (x[0], x[1], x[2], x[3]), dt))
+
+
+def _rk4_whole(plant, x, u, dt):
+    """The same step of the state as a whole, of which a derivative is faster."""
+
+    def slope(whole):
         # Keeps XLA from fusing the stages into one kernel, which recomputes the earlier ones.
-        return omega1, omega2, *jax.lax.optimization_barrier(alpha)
+        return (jax.lax.optimization_barrier(dynamics(plant, whole[0], u)),)
+
+    return _runge_kutta(slope, (x,), dt)[0]
+
+
+def _runge_kutta(slope, start, dt):
+    """The parts of a state after a step, of the parts ``start``."""
 
     def ahead(time, k):
         return tuple(p + time * s for p, s in zip(start, k, strict=True))
@@ -207,4 +231,19 @@ def rk4_step(plant: Plant, x: jax.Array, u: jax.Array, dt: float) -> jax.Array:
     k3 = slope(ahead(0.5 * dt, k2))
     k4 = slope(ahead(dt, k3))
     slopes = zip(start, k1, k2, k3, k4, strict=True)
-    return jnp.stack([p + dt / 6 * (a + 2 * (b + c) + d) for p, a, b, c, d in slopes])
+    return [p + dt / 6 * (a + 2 * (b + c) + d) for p, a, b, c, d in slopes]
+
+
+@partial(_rk4_step.defjvp, symbolic_zeros=True)
+def _rk4_derivative(primals, tangents):
+    """That of ``_rk4_whole``, in what has a tangent alone."""
+    leaves, structure = jax.tree.flatten(primals)
+    slopes = jax.tree.leaves(tangents, is_leaf=lambda t: isinstance(t, SymbolicZero))
+    moving = [i for i, slope in enumerate(slopes) if not isinstance(slope, SymbolicZero)]
+
+    def step(*those):
+        moved = dict(zip(moving, those, strict=True))
+        whole = [moved.get(i, leaf) for i, leaf in enumerate(leaves)]
+        return _rk4_whole(*jax.tree.unflatten(structure, whole))
+
+    return jax.jvp(step, [leaves[i] for i in moving], [slopes[i] for i in moving])
