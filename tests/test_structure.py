@@ -19,7 +19,7 @@ controller
 rollout
 criteria
 boards
-score sweep
+score sweep identification
 robustness fleet
 trajopt
 controllers

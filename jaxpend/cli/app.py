@@ -81,6 +81,11 @@ COMMANDS = {
         "look at runs", "list runs with their state and scores", "runs --json -", computes=False
     ),
     "report": Command("look at runs", "one page about a run, with pictures", "runs/mine"),
+    "identify": Command(
+        "in and out",
+        "a plant file of a robot, fitted to recorded runs of it",
+        "run1.csv run2.csv --design C.1/1.0 --out robot.yaml",
+    ),
     "optimise": Command(
         "optimise a trajectory", "find the best swing-up", "--robot acrobot --out swingup.npz"
     ),

@@ -16,6 +16,7 @@ from ..errors import JaxpendError
 from ..fields import BoardName, Count, Natural, Positive, Robot, Seed
 from .exporting import export as export
 from .fleets import hardware as hardware
+from .identifying import identify as identify
 from .importing import import_ as import_
 from .judging import Subject, board_of, of_draws
 from .output import ARRAYS, JSON, MARKDOWN, check_file, check_folder, emit, emit_json

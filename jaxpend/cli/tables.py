@@ -12,9 +12,11 @@ from ..terminal import console
 
 if TYPE_CHECKING:
     from ..boards import Board
+    from ..identification import Identified
 
 __all__ = [
     "hardware_table",
+    "identified_table",
     "leaderboard_table",
     "robustness_table",
     "runs_table",
@@ -103,6 +105,18 @@ def hardware_table(result: Mapping[str, Any], name: str) -> None:
         table.add_row(condition, *row, str(found["diverged"]))
     console.print(table)
     console.print("down: below the line after it was first reached, where it stands", style="dim")
+
+
+def identified_table(found: "Identified", nominal: Mapping[str, float]) -> None:
+    """Print what was fitted, beside where the search began."""
+    table = _table("", "identified", "+-", "before", title=f"{found.windows} windows")
+    for name, spread in found.deviations.items():
+        value = found.delay if name == "delay" else found.parameters[name]
+        before = f"{nominal.get(name, 0.0):.6g}"
+        table.add_row(name, Text(f"{value:.6g}", "bold"), f"{spread:.2g}", before)
+    console.print(table)
+    angles, velocities = found.noise
+    console.print(f"left over: {angles:.2g} rad, {velocities:.2g} rad/s (rms)", style="dim")
 
 
 def leaderboard_table(result: Mapping[str, Any], board: "Board") -> None:

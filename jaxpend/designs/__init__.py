@@ -21,14 +21,19 @@ from ..plant import Plant
 from ..robots import ROBOTS, active_joint
 
 __all__ = [
-    "COMPETITION", "ROBOTS", "active_joint", "available", "competition", "from_dict", "from_file",
-    "load", "parameters", "read",
+    "COMPETITION", "PAIRS", "ROBOTS", "active_joint", "available", "competition", "from_dict",
+    "from_file", "load", "parameters", "read",
 ]  # fmt: skip
 
 _REQUIRED = ("m1", "m2", "l1", "l2", "r1", "r2", "I1", "I2")
 _OPTIONAL = {
     "b1": 0.0, "b2": 0.0, "cf1": 0.0, "cf2": 0.0, "tl1": math.inf, "tl2": math.inf,
     "g": 9.81, "Ir": 0.0, "gr": 6.0,
+}  # fmt: skip
+# Field of a ``Plant`` -> parameter, of which there are two, such as m1 and m2.
+PAIRS = {
+    "mass": "m", "length": "l", "com": "r", "inertia": "I", "damping": "b",
+    "coulomb_friction": "cf",
 }  # fmt: skip
 # What a parameter may be; the others must be positive.
 _KINDS: dict[str, Any] = {
@@ -86,9 +91,7 @@ def from_dict(
         if not torque_limit > 0:
             raise JaxpendError(f"torque limit is {torque_limit} N m; it must be positive")
         limit = np.where(actuation, torque_limit, 0.0)
-    pairs = {"mass": "m", "length": "l", "com": "r", "inertia": "I", "damping": "b"}
-    pairs |= {"coulomb_friction": "cf"}
-    values: dict[str, Any] = {k: [p[f"{v}1"], p[f"{v}2"]] for k, v in pairs.items()}
+    values: dict[str, Any] = {k: [p[f"{v}1"], p[f"{v}2"]] for k, v in PAIRS.items()}
     values |= {"torque_limit": limit, "actuation": actuation, "gravity": p["g"]}
     values |= {"motor_inertia": p["Ir"], "gear_ratio": p["gr"]}
     # numpy, not jax, arrays: made inside a jitted function, they are still known constants.
