@@ -74,9 +74,20 @@ class PythonLaw(Memoryless):
 
     def __call__(self, carry, t, x):
         """The law's torque, (2,)."""
-        shape = jax.ShapeDtypeStruct((2,), x.dtype)
-        t = jnp.asarray(t, x.dtype)
-        return carry, jax.pure_callback(self._call, shape, t, x, vmap_method="broadcast_all")
+        # As bits: in a thread of its own, where jax calls Python, it would make float64 float32.
+        dtype, wide = x.dtype, (x.dtype.itemsize // 4,)
+
+        def call(t, x):
+            t, x = (np.ascontiguousarray(bits).view(dtype)[..., 0] for bits in (t, x))
+            return self._call(t, x)[..., None].view(np.uint32)
+
+        def bits(value):
+            found = jax.lax.bitcast_convert_type(jnp.asarray(value, dtype), jnp.uint32)
+            return found.reshape(*jnp.shape(value), *wide)
+
+        shape = jax.ShapeDtypeStruct((2, *wide), jnp.uint32)
+        torque = jax.pure_callback(call, shape, bits(t), bits(x), vmap_method="broadcast_all")
+        return carry, jax.lax.bitcast_convert_type(torque if wide[0] > 1 else torque[..., 0], dtype)
 
 
 def is_realaigym(thing: Any) -> bool:
