@@ -80,11 +80,12 @@ class Translator:
         def read(var: Any) -> Array:
             return self.constant(var.val) if isinstance(var, Literal) else known[var]
 
+        names = [eqn.primitive.name for eqn in jaxpr.eqns]
+        if unknown := [name for name in names if name not in self.rules]:
+            raise self.refuse(_why(unknown))
         for eqn in jaxpr.eqns:
-            rule = self.rules.get(eqn.primitive.name)
-            if rule is None:
-                raise self.refuse(_why(eqn.primitive.name))
             shape = getattr(eqn.outvars[0].aval, "shape", ()) if eqn.outvars else ()
+            rule = self.rules[eqn.primitive.name]
             found = rule(self, [read(var) for var in eqn.invars], eqn.params, shape)
             results = found if isinstance(found, list) else [found]
             known |= dict(zip(eqn.outvars, results, strict=True))
@@ -176,12 +177,12 @@ class Translator:
         return result
 
 
-def _why(primitive: str) -> str:
-    """What an operation does that cannot be printed."""
-    if primitive.startswith(("random_", "threefry", "rng_")):
+def _why(primitives: Sequence[str]) -> str:
+    """What a step does that cannot be printed, of which these are the operations without a rule."""
+    if any(name.startswith(("random_", "threefry", "rng_")) for name in primitives):
         return "it draws random numbers"
-    if "callback" in primitive or "debug" in primitive:
+    if any("callback" in name or "debug" in name for name in primitives):
         return "it calls Python"
-    if primitive == "while":
+    if "while" in primitives:
         return "a step of it loops for a number of times that is not fixed"
-    return f"it uses the operation {primitive} of jax, which has no counterpart there"
+    return f"it uses the operation {primitives[0]} of jax, which has no counterpart there"
