@@ -188,12 +188,16 @@ def euler_step(plant: Plant, x: jax.Array, u: jax.Array, dt: float) -> jax.Array
     return x + dt * dynamics(plant, x, u)
 
 
+# For all stages of a step, and all steps; the program is the same.
+_traced_once = partial(jax.jit, inline=True)
+
+
 def rk4_step(plant: Plant, x: jax.Array, u: jax.Array, dt: float) -> jax.Array:
     """State after ``dt`` seconds by the classical fourth-order Runge-Kutta rule, torque held."""
     friction = plant.coulomb_friction
     if not isinstance(friction, jax.core.Tracer | None) and not np.asarray(friction).any():
         plant = plant.replace(coulomb_friction=None)  # inside, one cannot see that it is zero
-    return _rk4_step(plant, x, u, dt)
+    return _traced_once(_rk4_step)(plant, x, u, dt)
 
 
 @jax.custom_jvp
@@ -205,7 +209,11 @@ def _rk4_step(plant, x, u, dt):
 
     def slope(parts):
         theta1, theta2, omega1, omega2 = parts
-        return omega1, omega2, *_accelerations(plant, theta1, theta2, omega1, omega2, u)
+        return (
+            omega1,
+            omega2,
+            *_traced_once(_accelerations)(plant, theta1, theta2, omega1, omega2, u),
+        )
 
     return jnp.stack(_runge_kutta(slope, (x[0], x[1], x[2], x[3]), dt))
 
@@ -215,7 +223,7 @@ def _rk4_whole(plant, x, u, dt):
 
     def slope(whole):
         # Keeps XLA from fusing the stages into one kernel, which recomputes the earlier ones.
-        return (jax.lax.optimization_barrier(dynamics(plant, whole[0], u)),)
+        return (jax.lax.optimization_barrier(_traced_once(dynamics)(plant, whole[0], u)),)
 
     return _runge_kutta(slope, (x,), dt)[0]
 

@@ -4,6 +4,8 @@ Short polynomials, of which XLA makes vector instructions; their coefficients ar
 Moshier's Cephes library (``sinf``, ``cosf``, ``atanf``).
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,13 +13,18 @@ import numpy as np
 __all__ = ["arctan", "sincos"]
 
 
-@jax.custom_jvp
+@partial(jax.jit, inline=True)
 def sincos(x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Sine and cosine (...) of (...) rad; in float32 to 8e-8 by one reduction for both.
 
     XLA's own took most of the time of a step on a CPU. The reduction to [-pi/4, pi/4] in three
     parts is good to 8000 rad; far beyond, where a float32 means nothing, both stay within [-1, 1].
     """
+    return _sincos(x)
+
+
+@jax.custom_jvp
+def _sincos(x):
     if jnp.result_type(x) != jnp.float32:
         return jnp.sin(x), jnp.cos(x)
     turns = jnp.round(x * (2 / np.pi))  # in quarters
@@ -33,13 +40,14 @@ def sincos(x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return sign * jnp.where(odd, cos, sin), sign * jnp.where(odd, -sin, cos)
 
 
-@sincos.defjvp
+@_sincos.defjvp
 def _slopes(primals, tangents):
     """Each is the slope of the other: cheaper than those of the polynomials, and exact."""
-    (sin, cos), (tangent,) = sincos(*primals), tangents
+    (sin, cos), (tangent,) = _sincos(*primals), tangents
     return (sin, cos), (cos * tangent, -sin * tangent)
 
 
+@partial(jax.jit, inline=True)
 def arctan(x: jax.Array) -> jax.Array:
     """Arctangent (...), rad; in float32 to 1.4e-7 by one division and a short polynomial.
 

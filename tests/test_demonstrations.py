@@ -108,7 +108,7 @@ def test_a_controller_that_wants_nothing_is_labelled_so():
 
 
 def test_imitation_of_the_swing_up_swings_up():
-    config = DemonstrationConfig(episodes=150, updates=8000, batch_size=512)
+    config = DemonstrationConfig(episodes=150, updates=8000, batch_size=256)
     env, actor = make(), Actor((64, 64), "tanh")
     keys = jax.random.split(jax.random.key(0), 3)
     shown = swingups(config, env, keys[0], reward_scale=0.1)

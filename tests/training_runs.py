@@ -12,12 +12,12 @@ import numpy as np
 
 RECIPE = "pendubot"
 OPTIONS = f"""
-    --config {RECIPE} --seed 3 --run run --sac.steps 1024 --sac.eval-every 32 --sac.num-envs 8
+    --config {RECIPE} --seed 3 --run run --sac.steps 1024 --sac.eval-every 64 --sac.num-envs 8
     --sac.batch-size 32 --sac.replay-capacity 128 --sac.critic-hidden 8 --sac.actor-hidden 8
     --sac.env.observation.history 2 --sac.env.randomised 0.5
     --sac.demonstrations.episodes 2 --sac.demonstrations.duration 1
-    --sac.demonstrations.updates 10_000 --sac.demonstrations.batch-size 32
-    --guard.no-rescue --snes.generations 12 --snes.population 4 --snes.chunk 1
+    --sac.demonstrations.updates 6_000 --sac.demonstrations.batch-size 32
+    --guard.no-rescue --snes.generations 6 --snes.population 4 --snes.chunk 1
 """.split()
 
 
