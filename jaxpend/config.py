@@ -297,6 +297,9 @@ class Run(Checked):
     seeds: Annotated[int, Bounds(above=0, most=1000)] = 1
     # Several seeds in one computation; auto: on an accelerator.
     vmap: Literal["auto", "yes", "no"] = "auto"
+    # How many GPUs, or cores of a processor, share rollouts; 0: all. The cores share the steps of
+    # SAC too where the number is given.
+    devices: Natural = 0
     # Name of the run folder; empty: ROBOT-seedSEED, of one stage alone ROBOT-STAGE-seedSEED, of
     # another board than v2 ROBOT-BOARD-...
     run: str = ""

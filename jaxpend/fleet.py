@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from . import devices
 from .boards import Task
 from .controller import Controller, check_controller, check_form, check_robot
 from .criteria import Criteria
@@ -122,9 +123,11 @@ def _tried(controller: Controller, keys: jax.Array, task: Task) -> tuple[Any, ..
         good = task.stands(run.x, length) & ~c.diverged
         return (good, task.score(c), down, c.diverged), off(scenario, task.plant)
 
-    each = jax.vmap(jax.vmap(one, (0, None)), (None, 0))
-    both, quantities = each(keys, jnp.array([False, True]))
-    return both, jax.tree.map(lambda values: values[1], quantities)
+    def both(key: jax.Array) -> tuple[Any, ...]:
+        found, quantities = jax.vmap(partial(one, key))(jnp.array([False, True]))
+        return found, {name: pair[1] for name, pair in quantities.items()}
+
+    return devices.split(jax.vmap(both))(keys)
 
 
 def judge_fleet(
@@ -158,10 +161,11 @@ def judge_fleet(
     for first in range(0, robots, CHUNK):
         # Filled up, so that all chunks share one program.
         rows = np.minimum(np.arange(first, first + min(CHUNK, robots)), robots - 1)
-        parts.append(jax.tree.map(np.asarray, _tried(controller, keys[rows], task)))
+        found = devices.compute(_tried, controller, keys[rows], task=task)
+        parts.append(jax.tree.map(np.asarray, found))
         say(min(first + CHUNK, robots))
     stands, score, down, diverged = (
-        np.concatenate([part[0][i] for part in parts], axis=1)[:, :robots] for i in range(4)
+        np.concatenate([part[0][i] for part in parts])[:robots].T for i in range(4)
     )
     names = parts[0][1]
     quantities = {n: np.concatenate([part[1][n] for part in parts])[:robots] for n in names}

@@ -1,9 +1,7 @@
 """The analytic gradient of a smooth form of the official score, through the simulator.
 
-The closed loop is differentiated from end to end, so that the effect of a parameter on the score
-seconds later is computed and not estimated from samples. Adam (Kingma and Ba, 2015) climbs from a
-trained policy, or from any other controller that declares what may be searched
-(``controllers/search_space.py``),
+The closed loop is differentiated from end to end. Adam (Kingma and Ba, 2015) climbs from a policy,
+or another controller that declares what may be searched (``controllers/search_space.py``),
 
     (1 - w) smooth v2 score of the nominal run + w mean upright time of random scenarios
         - r mean squared change of the action
@@ -12,8 +10,7 @@ The first is that of ``swingup.py``. The second is there only with ``config.scen
 over a run and over imperfect scenarios (``variations.sample``, new ones every step) of
 ``1 / (1 + d^2)``, d the distance to upright in units of what the benchmark calls a success; w is
 ``config.objective.weight``. The third, with ``config.retention``, keeps what the policy does in
-scenarios in which it stands already (``retained``), as a policy is kept near its old self where
-it is not to forget (Li and Hoiem, "Learning without forgetting", 2016).
+scenarios in which it stands already (``retained``; Li and Hoiem, "Learning without forgetting").
 
 Where motion is chaotic the gradient explodes and says nothing. Therefore the window is
 ``duration`` long, the norm of each run's gradient is clipped before they are averaged, a run
@@ -30,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from . import devices
 from .boards import Task, own_task
 from .config import GradientConfig, Run, TrainRun
 from .controller import Controller, check_controller
@@ -171,7 +169,7 @@ def slope(config: GradientConfig, start: Controller, task: Task, z: jax.Array, k
     keys = jax.random.split(key, 2 * config.scenarios)
     scenarios = jax.vmap(task.sample)(keys[: config.scenarios])
     each = jax.value_and_grad(lambda z, s, k: robustness(config, rebuild(z), s, k, task))
-    found = jax.vmap(each, in_axes=(None, 0, 0))(z, scenarios, keys[config.scenarios :])
+    found = devices.split(jax.vmap(partial(each, z)))(scenarios, keys[config.scenarios :])
     values, ascents, finite = jax.vmap(partial(_usable, config))(*found)
     weight, kept = config.objective.weight, jnp.maximum(finite.sum(), 1)
     ascent = (1 - weight) * ascent + weight * ascents.sum(axis=0) / kept
@@ -248,9 +246,8 @@ def improve(
         z = state.parameters
         ascent, lost, metrics = slope(config, start, task, z, key_now)
         if (kept := state.retained) is not None:
-            found = jax.value_and_grad(
-                lambda z: change(rebuild(z), kept, jax.random.fold_in(key_now, 1))
-            )(z)
+            key_kept = jax.random.fold_in(key_now, 1)
+            found = jax.value_and_grad(lambda z: change(rebuild(z), kept, key_kept))(z)
             ascent, metrics = ascent - config.retention * found[1], metrics | {"change": found[0]}
         move, memory = optimizer.update(ascent, state.optimizer)
         lost = state.lost + lost
@@ -296,11 +293,15 @@ class Gradient(SearchStage):
 
     def begin(self, seed: int, controller: Controller) -> SearchState:
         key = jax.random.fold_in(jax.random.key(seed), 2)
-        search = init(self.config, controller, key, self.task)
-        return SearchState(controller, search, jnp.asarray(0))
+        return SearchState(
+            controller, init(self.config, controller, key, self.task), jnp.asarray(0)
+        )
 
     def search(self, states: list[SearchState], count: int) -> list[tuple[GradientState, Row]]:
-        return [improve(self.config, s.start, s.search, count, self.task) for s in states]
+        chunk = partial(improve, self.config, steps=count, task=self.task)
+        if self.config.scenarios:  # the nominal run alone has nothing to share
+            chunk = partial(devices.compute, chunk)
+        return [chunk(state.start, state.search) for state in states]
 
     def judge(self, state: SearchState, metrics: Row) -> tuple[Row, Candidates]:
         policy = current(self.config, state.start, state.search)

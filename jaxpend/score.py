@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from . import devices
 from .boards import Board, Task, board
 from .config import Objective
 from .controller import Controller, check_controller, check_form, check_robot
@@ -69,7 +70,7 @@ def imperfect(
         run = rollout(scenario, controller, key, **options)
         return task.criteria(run, scenario.plant), task.stands(run.x, scenario.plant.length)
 
-    return jax.vmap(one)(scenarios, jax.random.split(key_runs, count))
+    return devices.split(jax.vmap(one))(scenarios, jax.random.split(key_runs, count))
 
 
 def combined(
@@ -118,7 +119,8 @@ def trial_run(
 
 @partial(jax.jit, static_argnames="task")
 def _trials(controller: Controller, scenarios: Scenario, task: Task) -> tuple[Criteria, jax.Array]:
-    return jax.vmap(lambda scenario: trial_run(controller, scenario, task)[1:])(scenarios)
+    every = jax.vmap(lambda scenario: trial_run(controller, scenario, task)[1:])
+    return devices.split(every)(scenarios)
 
 
 @partial(jax.jit, static_argnames="task")
@@ -171,7 +173,7 @@ def official(controller: Controller, judged_on: Board | str) -> dict[str, Any]:
             seeds = np.minimum(seeds, judged_on.draws - 1).tolist()
             scenarios = [judged_on.drawn(seed) for seed in seeds]
             batch = jax.tree.map(lambda *leaves: np.stack(leaves), *scenarios)
-            c, passive = _trials(ready, batch, task)
+            c, passive = devices.compute(_trials, ready, batch, task=task)
             _refuse_passive(float(passive.max()), task)
             found.append(jax.tree.map(np.asarray, c))
     count = judged_on.draws

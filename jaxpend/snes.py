@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import optax
 from evosax import algorithms
 
-from . import config
+from . import config, devices
 from .boards import Task, own_task
 from .config import GuardConfig, Run, SNESConfig, SNESRun
 from .controller import Controller, check_controller
@@ -149,11 +149,15 @@ def evolve(
     def generation(state, _):
         key, key_ask, key_noise, key_tell = jax.random.split(state.key, 4)
         population, inner = strategy.ask(key_ask, state.strategy, params)
-        scores, diverged = jax.lax.map(
-            lambda p: fitness(config, search.rebuild(p), key_noise, task),
-            population,
-            batch_size=_group(*population.shape),
-        )
+
+        def judged(individuals):
+            return jax.lax.map(
+                lambda p: fitness(config, search.rebuild(p), key_noise, task),
+                individuals,
+                batch_size=_group(*individuals.shape),
+            )
+
+        scores, diverged = devices.split(judged)(population)
         if config.strategy == "lm_ma_es":  # evosax weighs what it remembers by place, not by rank
             order = jnp.argsort(-scores)
             population, scores = population[order], scores[order]
@@ -233,8 +237,9 @@ class SNES(SearchStage):
 
         both = [(state.start, state.search) for state in states]
         if len(states) == 1:
-            return [chunk(*both[0])]
-        found = jax.vmap(chunk)(*jax.tree.map(lambda *leaves: jnp.stack(leaves), *both))
+            return [devices.compute(chunk, *both[0])]
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *both)
+        found = devices.compute(jax.vmap(chunk), *stacked)
         return [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(states))]
 
     def judge(self, state: SearchState, metrics: Row) -> tuple[Row, Candidates]:

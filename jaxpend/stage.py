@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 import jax
 import jax.numpy as jnp
 
+from . import devices
 from .boards import Task
 from .config import Objective, Run
 from .controller import Controller
@@ -117,7 +118,10 @@ def value(objective: Objective, controller: Controller, score: float, task: Task
     It is the score itself; of an objective that weighs scenarios it is ``score.combined`` on
     ``objective.validation`` of them, which stay the same.
     """
-    return float(_validated(objective, controller, score, task)) if objective.weight else score
+    if not objective.weight:
+        return score
+    found = devices.compute(lambda c, s: _validated(objective, c, s, task), controller, score)
+    return float(found)
 
 
 @pytree

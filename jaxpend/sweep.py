@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from . import devices
 from .controller import Controller, check_controller
 from .criteria import EPSILON, HEIGHT, Criteria, criteria, score_v2, upright
 from .errors import JaxpendError
@@ -49,7 +50,7 @@ def _run(scenarios, controller, keys, *, scoring, height, duration, **options):
         c = criteria(run.t, run.x, run.u, scenario.plant, height=height, t_final=duration)
         return run.x[-1], scoring(c)
 
-    x, score = jax.vmap(one)(scenarios, keys)
+    x, score = devices.split(jax.vmap(one))(scenarios, keys)
     return Outcome(x, upright(x), ~jnp.all(jnp.isfinite(x), axis=-1), score)
 
 
@@ -130,7 +131,7 @@ def sweep(
         scenarios, key, scored=scored, scoring=scoring, height=height, dt=dt, duration=duration,
         chunk=chunk,
     )  # fmt: skip
-    outcomes = [_run(piece, controller, keys, **static) for piece, keys in pieces]
+    outcomes = [devices.compute(_run, piece, controller, keys, **static) for piece, keys in pieces]
     n = len(scenarios.plant.mass)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:n], *outcomes)
 
@@ -142,7 +143,8 @@ def compile_sweep(
     check_controller(controller)
     pieces, static = _plan(scenarios, key, **options)
     first, keys = next(pieces)
-    _run.lower(first, controller, keys, **static).compile()
+    with devices.together(controller):
+        _run.lower(*devices.everywhere((first, controller, keys)), **static).compile()
 
 
 def _varied(scenario, controller, changes, draw_key, run_key, options) -> Outcome:

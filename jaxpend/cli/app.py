@@ -13,7 +13,7 @@ from typing import NoReturn
 
 from .. import __version__
 from ..errors import JaxpendError
-from .cache import VARIABLE, check_platform, compile_cache
+from .cache import VARIABLE, check_platform, compile_cache, share_processor
 from .options import parse, similar
 from .output import drop_unwritable
 
@@ -175,6 +175,7 @@ def run(function: Callable[..., None], prog: str, args: Sequence[str] | None = N
         if call.func is not print:  # which prints the help
             compile_cache()
             if about.computes:
+                share_processor()
                 check_platform()
                 # It prints the traceback of a user's function, which becomes a sentence here.
                 logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)

@@ -1,5 +1,6 @@
 """How jax is set up before a command computes: kept programs, and the platform asked for."""
 
+import contextlib
 import os
 import sys
 import warnings
@@ -8,9 +9,10 @@ from pathlib import Path
 from ..errors import JaxpendError
 from ..fields import OFF, ON
 
-__all__ = ["VARIABLE", "cache_folder", "check_platform", "compile_cache"]
+__all__ = ["VARIABLE", "cache_folder", "check_platform", "compile_cache", "share_processor"]
 
 VARIABLE = "JAXPEND_CACHE"
+MOST = 32  # cores that are shared among
 
 
 def cache_folder() -> Path | None:
@@ -53,6 +55,22 @@ def compile_cache() -> None:
             os.environ[name.upper()] = str(value)
             if "jax" in sys.modules:  # python -m jaxpend.X: it has read its environment already
                 sys.modules["jax"].config.update(name, value)
+
+
+def share_processor() -> None:
+    """Make a device of each core, for ``devices`` to share rollouts among.
+
+    XLA's own threads share too little of a step. What the environment says has the last word.
+    """
+    said = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if said or "JAX_NUM_CPU_DEVICES" in os.environ:
+        return
+    import jax
+
+    known = hasattr(os, "sched_getaffinity")  # not on macOS
+    cores = len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
+    with contextlib.suppress(RuntimeError):  # whoever called has computed already
+        jax.config.update("jax_num_cpu_devices", min(cores, MOST))
 
 
 def check_platform() -> None:

@@ -9,11 +9,11 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import Literal
 
 from ..config import GradientRun, Run, SACRun, Search, SNESRun, TrainRun
 from ..errors import JaxpendError
-from ..fields import BoardName, Count, Natural, Positive, Robot, Seed
+from ..fields import BoardName, Count, Natural, Robot, Seed
+from .benchmarking import robustness as robustness
 from .exporting import export as export
 from .fleets import hardware as hardware
 from .identifying import identify as identify
@@ -226,82 +226,6 @@ def _recorded(csv, subject, board, hardware, save):
     return result | {"csv": csv, "plant": subject.plant, "design": subject.design}
 
 
-def robustness(
-    robot: Robot = "pendubot",
-    policy: str | None = None,
-    controller: str | None = None,
-    plant: str | None = None,
-    design: str | None = None,
-    torque_limit: Positive = 6.0,
-    seed: Seed = 0,
-    keys: Count = 3,
-    precision: Literal["float32", "float64"] = "float32",
-    scored: bool = False,
-    map: tuple[str, str] | None = None,
-    worst: Natural = 0,
-    chunk: Count | None = None,
-    out: Path | None = Path("runs/robustness"),
-    json: str | None = None,
-) -> None:
-    """The official six-criterion robustness benchmark of a controller.
-
-    Args:
-        robot: which joint is driven: the second of the acrobot, the first of the pendubot.
-        policy: a policy or controller file; by default the policy that ships with the package.
-        controller: judge this instead: a known one such as tvlqr, or module:name of a
-            controller, or of one written for RealAIGym or a Python function (t, x) -> torque,
-            which take minutes. With a policy too: the known one around that policy, or the file
-            of your own classes.
-        plant: YAML file of the parameters of another plant than that of the boards.
-        design: or an identified plant by name, such as C.1/1.0.
-        torque_limit: of the driven joint, N m; 6 on the boards.
-        seed: of the first key.
-        keys: repeat the criteria that draw something this often; the median counts.
-        precision: float32, or float64 as the reference computes.
-        scored: the mean v2 performance score at every grid value as well.
-        map: success over two imperfections, such as "m2 delay", 21 x 21 runs.
-        worst: look for the mildest combination of imperfections that fails, in so many tries.
-        chunk: runs at a time; less needs less memory.
-        out: folder for picture, CSV and JSON, of both robots once they are there; or None.
-        json: write the result as JSON to this file, or "-" for standard output.
-    """
-    check_folder(out)
-    check_file(json, JSON)
-    subject = Subject(robot, policy, controller, plant, design, torque_limit)
-    import jax
-
-    from .tables import robustness_table
-
-    board = subject.board
-    result = {"robot": robot, "controller": controller or policy or robot, "seed": seed}
-    result |= {"plant": plant, "design": design, "precision": precision}
-    result["torque_limit"] = torque_limit
-    with jax.enable_x64(precision == "float64"):
-        judged, key = subject.find(board), jax.random.key(seed)
-        options = {"scored": scored, "chunk": chunk}
-        result |= _benchmarked(judged, board.task.plant, key, keys, map, worst, options)
-    robustness_table(result, board)
-    if out is not None:
-        from ..report.figures import write_robustness
-
-        write_robustness(result, out)
-    emit_json(result, json)
-
-
-def _benchmarked(judged, plant, key, keys, map, worst, options):
-    """The report of the benchmark, and the map and the mildest failure that are asked for."""
-    from ..robustness import benchmark, nominal_and_worst, success_map
-    from ..sweep import mildest_failure
-
-    # The map comes first, since it refuses names that it does not know.
-    drawn = {} if map is None else {"map": success_map(judged, plant, map, key, options)}
-    result = benchmark(judged, plant, key, keys=keys, **options).as_dict() | drawn
-    if worst:
-        bounds = nominal_and_worst(plant)
-        result["worst"] = mildest_failure(plant, judged, bounds, key, samples=worst)
-    return result
-
-
 def leaderboard(
     robot: Robot = "pendubot",
     controllers: str | None = None,
@@ -316,6 +240,7 @@ def leaderboard(
     out: Path | None = None,
     board: BoardName = "v2",
     draws: Count | None = None,
+    devices: Natural = 0,
 ) -> None:
     """Judge controllers on performance and robustness, next to the published ones.
 
@@ -331,6 +256,7 @@ def leaderboard(
         robustness: run the robustness benchmark too (minutes for MPC).
         keys: repetitions of what the benchmark draws at random; the median counts.
         seed: of the benchmark's first key.
+        devices: how many GPUs, or cores of a processor, share the runs; 0: all.
         json: write the result as JSON to this file, or "-" for standard output.
         out: write the table as Markdown to this file, or "-" for standard output.
     """
@@ -338,8 +264,11 @@ def leaderboard(
     check_file(out, MARKDOWN)
     _apart(json=json, out=out)
     from .. import leaderboard as boards
+    from ..devices import use
     from ..terminal import console
     from .tables import leaderboard_table
+
+    use(devices)
 
     def say(line: str) -> None:
         console.print(line, style="dim")

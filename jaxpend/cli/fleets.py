@@ -3,7 +3,7 @@
 import dataclasses
 from pathlib import Path
 
-from ..fields import Count, Preset, Robot, Seed
+from ..fields import Count, Natural, Preset, Robot, Seed
 from .judging import Subject
 from .output import JSON, check_file, check_folder, emit_json
 
@@ -19,6 +19,7 @@ def hardware(
     seed: Seed = 0,
     plant: str | None = None,
     design: str | None = None,
+    devices: Natural = 0,
     out: Path | None = Path("runs/hardware"),
     json: str | None = None,
 ) -> None:
@@ -33,6 +34,7 @@ def hardware(
         seed: of the draws.
         plant: YAML file of the nominal parameters, by default those of design C.1 model 1.0.
         design: or an identified plant by name, such as C.1/1.1.
+        devices: how many GPUs, or cores of a processor, share the robots; 0: all.
         out: folder for the picture and the JSON; or None.
         json: write the result as JSON to this file, or "-" for standard output.
     """
@@ -41,11 +43,13 @@ def hardware(
     subject = Subject(robot, policy, controller, plant, design, on="hardware")
     import jax
 
+    from ..devices import use
     from ..fleet import judge_fleet
     from ..hardware import PRESETS
     from ..terminal import console
     from .tables import hardware_table
 
+    use(devices)
     board = subject.board
     task = dataclasses.replace(board.task, spread=PRESETS[preset])
     result = {"robot": robot, "preset": preset, "seed": seed} | subject.about

@@ -5,7 +5,7 @@ So are controllers written for the RealAIGym ``double_pendulum`` package, which 
 
 import copy
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +40,7 @@ class PythonLaw(Memoryless):
 
     law: Callable = static()
     batched: bool = static(default=False)
+    calls_python: ClassVar = True  # see ``devices.together``
 
     def _call(self, t: np.ndarray, x: np.ndarray) -> np.ndarray:
         t, x = np.asarray(t), np.asarray(x)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from .. import devices
 from ..boards import Task
 from ..config import SACConfig
 from ..controllers.policy import Policy
@@ -250,7 +251,7 @@ def interact(agent: Agent, state: SACState, key: jax.Array) -> tuple[SACState, j
     action, _ = act(agent.actor, state.actor, before.obs, key_action)
     uniform = jax.random.uniform(key_uniform, action.shape, minval=-1.0, maxval=1.0)
     action = jnp.where(state.env_steps < config.warmup_steps, uniform, action)
-    after = jax.vmap(env.step)(before, action)
+    after = devices.split(jax.vmap(env.step))(before, action)
     now = Transition.between(before, action, after, config.reward_scale)
     over = truncated(config.env, after, state.env_time + 1)
     fresh = jax.vmap(env.reset)(jax.random.split(key_reset, config.num_envs))
@@ -298,7 +299,7 @@ def train_chunk(agent: Agent, state: SACState, vector_steps: int) -> tuple[SACSt
     def learn(state, key):
         key_batch, key_update = jax.random.split(key)
         keys = jax.random.split(key_update, config.updates_per_step)
-        batches = sample(agent, state, key_batch)
+        batches = devices.spread(sample(agent, state, key_batch), axis=1)
         return jax.lax.scan(lambda s, i: update(agent, s, *i), state, (batches, keys))
 
     def idle(state, key):

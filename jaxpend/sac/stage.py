@@ -1,11 +1,13 @@
 """The stages of ``jaxpend sac``: imitation of demonstrations, and SAC itself."""
 
+import contextlib
 from functools import partial
 from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 
+from .. import devices
 from ..boards import Task
 from ..config import Run, SACConfig
 from ..controller import Controller
@@ -132,9 +134,14 @@ class SAC(Stage[SACState | None, SACState, Controller]):
         # The last chunk is as long as what is left, in whole steps of all environments.
         left = -(-(self.total - self.done(states[0])) // self.agent.config.num_envs)
         steps = min(self.vector_steps, left)
-        if len(states) == 1:
-            return [algorithm.train_chunk(self.agent, states[0], steps)]
-        return algorithm.train_chunks(self.agent, states, steps)
+        # A step of SAC is too small to be shared among the cores of a processor, unless asked.
+        shared = devices.asked() or jax.default_backend() != "cpu"
+        with contextlib.ExitStack() as around:
+            if shared:
+                around.enter_context(devices.together())
+            if len(states) == 1:
+                return [algorithm.train_chunk(self.agent, states[0], steps)]
+            return algorithm.train_chunks(self.agent, states, steps)
 
     def judge(self, state: SACState, metrics: Row) -> tuple[Row, Candidates]:
         policy = algorithm.greedy_policy(self.agent, state)

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from .. import devices
 from ..boards import Task, named_board, task_of
 from ..config import GradientRun, Run, SNESRun
 from ..controller import Controller
@@ -110,6 +111,7 @@ def train(
         JaxpendError: the folder cannot be used or written, or training diverged.
         Stopped: a signal asked for it, and everything is on disk.
     """
+    devices.use(config.devices)
     task, start = task_of(config.robot, config.plant, config.design, config.board), None
     if isinstance(config, GradientRun | SNESRun):
         # Before the folder is made: a wrong file leaves nothing behind.

@@ -1,0 +1,128 @@
+"""Rows that have nothing to do with each other, computed on several devices at once.
+
+JAX's own sharding does all of it: ``together`` puts a mesh of one axis around a computation, and
+``split`` lets each device of it compute a share of the rows. What a row gives does not depend on
+how many devices there are, up to rounding.
+"""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from .errors import JaxpendError
+
+__all__ = ["asked", "compute", "everywhere", "split", "spread", "together", "use"]
+
+AXIS = "rows"
+_asked = 0
+
+
+def use(count: int) -> None:
+    """How many devices to use from now on, the first of ``jax.devices()``; 0: all of them.
+
+    Raises ``JaxpendError`` where there are not so many.
+    """
+    global _asked
+    there = len(jax.devices())
+    if count > there:
+        few = f"devices is {count}; jax has {there} here"
+        if jax.default_backend() == "cpu":
+            few += ", and XLA_FLAGS=--xla_force_host_platform_device_count=N makes N of a processor"
+        raise JaxpendError(few)
+    _asked = count
+
+
+def asked() -> bool:
+    """Whether ``use`` was told how many."""
+    return _asked > 0
+
+
+def _mesh() -> Mesh | None:
+    """The devices in use, if they are several."""
+    devices = jax.devices()[: _asked or None]
+    if len(devices) == 1:
+        return None
+    return jax.make_mesh((len(devices),), (AXIS,), (AxisType.Auto,), devices=devices)
+
+
+def _call_python(arguments: Any) -> bool:
+    """Whether a controller among them is a ``PythonLaw``, or is made with one."""
+
+    def calls(node: Any) -> bool:
+        return getattr(node, "calls_python", False)
+
+    return any(map(calls, jax.tree.leaves(arguments, is_leaf=calls)))
+
+
+def _shares() -> int:
+    """Among how many devices rows can be shared here; 1 within a share."""
+    mesh = jax.sharding.get_abstract_mesh()
+    return mesh.shape[AXIS] if AXIS in mesh.auto_axes else 1
+
+
+@contextlib.contextmanager
+def together(*arguments: Any) -> Iterator[Mesh | None]:
+    """Inside, a compiled function runs on all devices in use: see ``split``.
+
+    Not if one of its arguments calls Python, which has one state at a time.
+    """
+    mesh = None if _call_python(arguments) else _mesh()
+    if mesh is None:
+        yield None
+        return
+    with jax.set_mesh(mesh):
+        yield mesh
+
+
+def compute(function: Callable[..., Any], *args: Any, **static: Any) -> Any:
+    """What a function of arrays gives on all devices in use; it lies on the first one then.
+
+    Every computation around it stays on one device. ``static`` are arguments that hold no arrays.
+    """
+    with together(*args) as mesh:
+        found = function(*everywhere(args), **static)
+    return found if mesh is None else jax.device_put(found, mesh.devices.flat[0])
+
+
+def everywhere(tree: Any) -> Any:
+    """Arrays, of which each device has a copy where ``together`` is in force."""
+    mesh = jax.sharding.get_mesh()
+    return tree if mesh.empty else jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+def split(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of rows, of which each device computes its share where ``together`` is in force.
+
+    ``function`` takes pytrees of arrays (n, ...), gives pytrees of arrays (n, ...), and treats
+    every row alone, as one made by ``jax.vmap`` does. Where the devices do not divide n, the last
+    row is computed several times.
+    """
+    size = _shares()
+    if size == 1:
+        return function
+
+    def shared(*rows: Any) -> Any:
+        n = len(jax.tree.leaves(rows)[0])
+        index = jnp.minimum(jnp.arange(-(-n // size) * size), n - 1)
+        filled = jax.tree.map(lambda leaf: leaf[index], rows) if n % size else rows
+        by_row = PartitionSpec(AXIS)
+        share = jax.shard_map(function, in_specs=by_row, out_specs=by_row, check_vma=False)
+        found = jax.tree.map(lambda leaf: leaf[:n], share(*filled))
+        return jax.lax.with_sharding_constraint(found, PartitionSpec())
+
+    return shared
+
+
+def spread(tree: Any, axis: int = 0) -> Any:
+    """Arrays of which each device holds a share along an axis, where that can be divided.
+
+    What is computed of them is then shared as well; XLA adds what the devices have to exchange.
+    """
+    size = _shares()
+    if size == 1 or any(leaf.shape[axis] % size for leaf in jax.tree.leaves(tree)):
+        return tree
+    return jax.lax.with_sharding_constraint(tree, PartitionSpec(*[None] * axis, AXIS))
