@@ -181,7 +181,8 @@ def again(controller, times, states):
 
 
 def test_the_header_needs_no_more_than_it_says(tmp_path):
-    text = to_c.source(controller("guarded history", "float32"), prefix="our")
+    made = controller("guarded history", "float32")
+    text = to_c.source(made, prefix="our", precision="float32")
     called = set(re.findall(r"\b(\w+f)\(", text)) | set(re.findall(r"\b(\w*alloc\w*)\(", text))
     assert called == {"tanhf"}
     assert "double" not in text
@@ -274,7 +275,7 @@ def test_every_printer_prints_every_operation(tmp_path):
         np.testing.assert_allclose(
             session.run(["torque"], {"t": np.asarray(t), "x": x})[0], u, rtol=1e-9
         )
-    (tmp_path / "controller.h").write_text(to_c.source(law, prefix="our"))
+    (tmp_path / "controller.h").write_text(to_c.source(law, prefix="our", precision="float32"))
     (tmp_path / "loop.c").write_text(LOOP)
     flags = "-std=c99 -Wall -Werror -O2 -shared -fPIC loop.c -o loop.so -lm"
     subprocess.run(["gcc", *flags.split()], cwd=tmp_path, check=True)

@@ -37,14 +37,14 @@ OPERATORS = {
 ROWS = {"total": "ReduceSum", "largest": "ReduceMax", "smallest": "ReduceMin"}
 
 
-def model(controller: Controller, *, precision: str = "float32") -> Any:
+def model(controller: Controller, *, precision: str = "float64") -> Any:
     """The ``onnx.ModelProto``; ``SerializeToString()`` gives the content of a file.
 
     Policies act without their ``action_noise``.
 
     Args:
         controller: any that can be traced.
-        precision: "float32" or "float64".
+        precision: "float64" or "float32".
 
     Raises:
         JaxpendError: as ``trace.trace``, or onnx is not installed.
