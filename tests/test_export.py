@@ -88,19 +88,32 @@ def test_numpy_gives_the_same_torques_on_the_same_measurements(name):
         np.testing.assert_allclose(replayed(in_numpy(name), times, x), u, rtol=0, atol=1e-10)
 
 
-def test_the_loop_that_an_exported_controller_closes_is_the_same():
+def test_the_loop_that_an_exported_controller_closes_is_the_same(tmp_path):
     task, name = task_of("pendubot"), "shipped"
-    with jax.enable_x64(True):
-        exported = in_numpy(name)
-        exported.reset()
-        run = rollout(task.plant, PythonLaw(exported.torque), jax.random.key(0))
+    library = in_c(name, tmp_path, "float64")
+    exported = in_numpy(name)
+    exported.reset()
+
+    def act(t, x):
+        if t == 0:
+            library.begin()
+        torque, x = np.empty(2), np.ascontiguousarray(x)
+        library.act(ctypes.c_double(t), floats(x, ctypes.c_double), floats(torque, ctypes.c_double))
+        return torque
+
     _, states, torques = recorded(name, "float64")
-    np.testing.assert_allclose(run.x_measured, states[0], rtol=0, atol=1e-6)
-    np.testing.assert_allclose(run.u_command, torques[0], rtol=0, atol=1e-5)
+    for law in (exported.torque, act):
+        with jax.enable_x64(True):
+            run = rollout(task.plant, PythonLaw(law), jax.random.key(0))
+        np.testing.assert_allclose(run.x_measured, states[0], rtol=0, atol=1e-8)
+        np.testing.assert_allclose(run.u_command, torques[0], rtol=0, atol=1e-8)
 
 
 def in_c(name, folder, precision="float32"):
-    """A library whose ``run`` takes a number of steps N, times, states (N, 4), torques (N, 2)."""
+    """A library whose ``run`` takes a number of steps N, times, states (N, 4), torques (N, 2).
+
+    Its ``act`` is one step after ``begin``.
+    """
     arrays = "float32" if precision == "float32" else "float64"
     text = to_c.source(controller(name, arrays), prefix="our", precision=precision)
     (folder / "controller.h").write_text(text)
@@ -113,6 +126,9 @@ def in_c(name, folder, precision="float32"):
 
 LOOP = """
 #include "controller.h"
+static our_state now;
+void begin(void) { our_init(&now); }
+void act(float t, const float *x, float *torque) { our_step(&now, t, x, torque); }
 void run(int n, const float *t, const float *x, float *torque)
 {
     our_state state;

@@ -69,7 +69,9 @@ def test_numpy(policy, wanted):
 
 def test_onnx(policy, wanted):
     runtime = pytest.importorskip("onnxruntime")
-    session = runtime.InferenceSession(to_onnx.model(policy, precision="float32").SerializeToString())
+    session = runtime.InferenceSession(
+        to_onnx.model(policy, precision="float32").SerializeToString()
+    )
     named = {i.name: i for i in session.get_inputs()}
     assert set(named) == {"t", "x"}
     for x, torque in zip(STATES.astype("f4"), wanted, strict=True):
@@ -78,7 +80,7 @@ def test_onnx(policy, wanted):
 
 
 def test_c(policy, wanted, tmp_path):
-    (tmp_path / "policy.h").write_text(to_c.source(policy, prefix="policy"))
+    (tmp_path / "policy.h").write_text(to_c.source(policy, prefix="policy", precision="float32"))
     (tmp_path / "main.c").write_text(
         '#include "policy.h"\n'
         "void torque(const float *x, float *u)\n"

@@ -33,10 +33,10 @@ def export(
             c, a header without allocation; realaigym, a submission to its boards in numpy, with
             what they measure, which takes a while.
         out: file to write; for realaigym a folder, whose name the submission has.
-        precision: float64, in which numpy and onnx compute unless told, for torques within 1e-9 N m
-            of those here; mixed, that of c unless told: float goes in and comes out, double
-            computes, within 1e-5; float32, for a processor without double: a guard's observer
-            multiplies rounding, so that it is within 3e-3 there.
+        precision: float64 unless told, for torques within 1e-9 N m of those here; mixed, for c:
+            float goes in and comes out, double computes, within 1e-5; float32, for a processor
+            that has nothing else: a guard's observer multiplies rounding, so that it is within
+            3e-3 there. numpy has float64 alone.
     """
     if to in ("numpy", "realaigym") and precision not in (None, "float64"):
         text = f"--precision is {precision}; {to} computes in float64 alone: leave it out"
@@ -51,7 +51,7 @@ def export(
     from ..controllers.files import load_controller
     from ..terminal import console
 
-    precision = precision or ("mixed" if to == "c" else "float64")
+    precision = precision or "float64"
     with jax.enable_x64(precision != "float32"):
         controller = load_controller(policy)
     content = _content(controller, to, out, precision)
