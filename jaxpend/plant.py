@@ -188,8 +188,8 @@ def euler_step(plant: Plant, x: jax.Array, u: jax.Array, dt: float) -> jax.Array
     return x + dt * dynamics(plant, x, u)
 
 
-# For all stages of a step, and all steps; the program is the same.
-_traced_once = partial(jax.jit, inline=True)
+# And batched, differentiated and lowered once, for all stages of a step; XLA makes them one again.
+_traced_once = jax.jit
 
 
 def rk4_step(plant: Plant, x: jax.Array, u: jax.Array, dt: float) -> jax.Array:

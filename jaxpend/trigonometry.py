@@ -4,8 +4,6 @@ Short polynomials, of which XLA makes vector instructions; their coefficients ar
 Moshier's Cephes library (``sinf``, ``cosf``, ``atanf``).
 """
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +11,7 @@ import numpy as np
 __all__ = ["arctan", "sincos"]
 
 
-@partial(jax.jit, inline=True)
+@jax.jit
 def sincos(x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Sine and cosine (...) of (...) rad; in float32 to 8e-8 by one reduction for both.
 
@@ -47,7 +45,7 @@ def _slopes(primals, tangents):
     return (sin, cos), (cos * tangent, -sin * tangent)
 
 
-@partial(jax.jit, inline=True)
+@jax.jit
 def arctan(x: jax.Array) -> jax.Array:
     """Arctangent (...), rad; in float32 to 1.4e-7 by one division and a short polynomial.
 

