@@ -108,6 +108,8 @@ def split(function: Callable[..., Any]) -> Callable[..., Any]:
     def shared(*rows: Any) -> Any:
         n = len(jax.tree.leaves(rows)[0])
         index = jnp.minimum(jnp.arange(-(-n // size) * size), n - 1)
+        # Every device makes all rows, so that none sends any to another.
+        rows = jax.lax.with_sharding_constraint(rows, PartitionSpec())
         filled = jax.tree.map(lambda leaf: leaf[index], rows) if n % size else rows
         by_row = PartitionSpec(AXIS)
         share = jax.shard_map(function, in_specs=by_row, out_specs=by_row, check_vma=False)

@@ -16,11 +16,10 @@ from typing import Any, Self
 import jax
 import jax.numpy as jnp
 import optax
-from evosax import algorithms
 
-from . import config, devices
+from . import devices
 from .boards import Task, own_task
-from .config import GuardConfig, Run, SNESConfig, SNESRun
+from .config import STRATEGIES, GuardConfig, Run, SNESConfig, SNESRun
 from .controller import Controller, check_controller
 from .controllers.guard import guard
 from .controllers.policy import change_policies
@@ -36,9 +35,7 @@ __all__ = [
 ]  # fmt: skip
 
 # Bytes of parameters that a CPU keeps near: of large networks a few at a time are faster.
-NEAR = 3e6
-
-STRATEGIES = {name: getattr(algorithms, kind) for name, kind in config.STRATEGIES.items()}
+NEAR = 1.2e6
 
 
 @pytree
@@ -97,7 +94,9 @@ class _Search:
         per_coordinate = config.strategy == "snes"
         self.unit = jnp.ones((), flat.dtype) if per_coordinate else std
         self.start, self.rebuild = flat / self.unit, lambda z: rebuild(self.unit * z)
-        kind = STRATEGIES[config.strategy]
+        with jax.ensure_compile_time_eval():  # evosax computes when it is imported
+            from evosax import algorithms
+        kind = getattr(algorithms, STRATEGIES[config.strategy])
         self.strategy = kind(population_size=config.population, solution=flat, **options)
         with jax.ensure_compile_time_eval():  # LM-MA-ES turns a number of vectors into an int
             self.params = self.strategy.default_params

@@ -42,6 +42,21 @@ def test_devices_share_the_updates_of_sac(found):
     assert (found["1"]["exchanged"], found["8"]["exchanged"]) == (False, True)
 
 
+def test_the_cores_are_devices_since_no_import_computes():
+    code = (
+        "import os, jaxpend.train, jaxpend.report, jaxpend.leaderboard, jaxpend.interop\n"
+        "from jaxpend.cli.cache import share_processor\n"
+        "share_processor()\n"
+        "import jax\n"
+        "known = hasattr(os, 'sched_getaffinity')\n"
+        "cores = len(os.sched_getaffinity(0)) if known else os.cpu_count()\n"
+        "assert jax.device_count() == min(cores, 32)\n"
+    )
+    if "host_platform_device_count" in os.environ["XLA_FLAGS"]:
+        pytest.skip("XLA_FLAGS says how many devices there are")
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_more_devices_than_there_are_is_one_sentence(monkeypatch, capsys):
     with refused("devices is 99; jax has 1 here, and XLA_FLAGS=--xla_force_host"):
         devices.use(99)
