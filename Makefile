@@ -83,8 +83,8 @@ lint: $(STAMP)  ## ruff: rules and format; mypy: types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(STAMP)  ## time rollouts, SAC and SNES on this machine
-	$(BIN)/python experiments/bench.py $(ARGS)
+bench: $(STAMP)  ## time every part on this machine, beside other ways to do it (20 minutes)
+	$(BIN)/python experiments/bench $(ARGS)
 
 clean:  ## remove the virtual environment and caches; runs/ stays
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build *.egg-info
