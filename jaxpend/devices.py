@@ -29,10 +29,11 @@ def use(count: int) -> None:
     global _asked
     there = len(jax.devices())
     if count > there:
-        few = f"devices is {count}; jax has {there} here"
+        text = f"devices is {count}; jax has {there} here"
         if jax.default_backend() == "cpu":
-            few += ", and XLA_FLAGS=--xla_force_host_platform_device_count=N makes N of a processor"
-        raise JaxpendError(few)
+            flag = "--xla_force_host_platform_device_count=N"
+            text += f", and XLA_FLAGS={flag} makes N of a processor"
+        raise JaxpendError(text)
     _asked = count
 
 
@@ -65,17 +66,17 @@ def _shares() -> int:
 
 
 @contextlib.contextmanager
-def together(*arguments: Any) -> Iterator[Mesh | None]:
+def together(*arguments: Any) -> Iterator[None]:
     """Inside, a compiled function runs on all devices in use: see ``split``.
 
     Not if one of its arguments calls Python, which has one state at a time.
     """
     mesh = None if _call_python(arguments) else _mesh()
     if mesh is None:
-        yield None
+        yield
         return
     with jax.set_mesh(mesh):
-        yield mesh
+        yield
 
 
 def compute(function: Callable[..., Any], *args: Any, **static: Any) -> Any:
@@ -83,9 +84,9 @@ def compute(function: Callable[..., Any], *args: Any, **static: Any) -> Any:
 
     Every computation around it stays on one device. ``static`` are arguments that hold no arrays.
     """
-    with together(*args) as mesh:
+    with together(*args):
         found = function(*everywhere(args), **static)
-    return found if mesh is None else jax.device_put(found, mesh.devices.flat[0])
+    return found if _mesh() is None else jax.device_put(found, jax.devices()[0])
 
 
 def everywhere(tree: Any) -> Any:

@@ -70,6 +70,7 @@ def learned(folder):
     """SAC for a chunk, and from its checkpoint for another one on a single device."""
     stage, checkpoints = SAC(SMALL, TASK), Checkpoints(folder, 1)
     ((state, first),) = stage.advance([stage.start(0, None)])
+    assert all(len(leaf.devices()) == 1 for leaf in jax.tree.leaves((state, first)))
     checkpoints.save({"state": state}, {})
     state, _ = checkpoints.newest(lambda _: {"state": stage.like()})
     devices.use(1)

@@ -1,6 +1,5 @@
 """The stages of ``jaxpend sac``: imitation of demonstrations, and SAC itself."""
 
-import contextlib
 from functools import partial
 from typing import Any, Self
 
@@ -135,13 +134,14 @@ class SAC(Stage[SACState | None, SACState, Controller]):
         left = -(-(self.total - self.done(states[0])) // self.agent.config.num_envs)
         steps = min(self.vector_steps, left)
         # A step of SAC is too small to be shared among the cores of a processor, unless asked.
-        shared = devices.asked() or jax.default_backend() != "cpu"
-        with contextlib.ExitStack() as around:
-            if shared:
-                around.enter_context(devices.together())
-            if len(states) == 1:
-                return [algorithm.train_chunk(self.agent, states[0], steps)]
-            return algorithm.train_chunks(self.agent, states, steps)
+        if not devices.asked() and jax.default_backend() == "cpu":
+            return self._trained(states, steps)
+        return devices.compute(partial(self._trained, steps=steps), states)
+
+    def _trained(self, states: list[SACState], steps: int) -> list[tuple[SACState, Row]]:
+        if len(states) == 1:
+            return [algorithm.train_chunk(self.agent, states[0], steps)]
+        return algorithm.train_chunks(self.agent, states, steps)
 
     def judge(self, state: SACState, metrics: Row) -> tuple[Row, Candidates]:
         policy = algorithm.greedy_policy(self.agent, state)
