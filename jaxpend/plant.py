@@ -188,7 +188,8 @@ def euler_step(plant: Plant, x: jax.Array, u: jax.Array, dt: float) -> jax.Array
     return x + dt * dynamics(plant, x, u)
 
 
-# And batched, differentiated and lowered once, for all stages of a step; XLA makes them one again.
+# A function that is compiled by itself in a program is traced, batched, differentiated and lowered
+# once for all its calls there; XLA puts them together again.
 _traced_once = jax.jit
 
 
@@ -209,11 +210,8 @@ def _rk4_step(plant, x, u, dt):
 
     def slope(parts):
         theta1, theta2, omega1, omega2 = parts
-        return (
-            omega1,
-            omega2,
-            *_traced_once(_accelerations)(plant, theta1, theta2, omega1, omega2, u),
-        )
+        alpha = _traced_once(_accelerations)(plant, theta1, theta2, omega1, omega2, u)
+        return omega1, omega2, *alpha
 
     return jnp.stack(_runge_kutta(slope, (x[0], x[1], x[2], x[3]), dt))
 

@@ -133,17 +133,17 @@ def short(robot, duration=5.0, resets=1, **fields):
 
 def test_the_score_is_the_mean_of_the_draws():
     robot = "acrobot"
-    board = short(robot, draws=35)
+    board = short(robot, draws=70)
     policy = network_in(load_policy(robot))
     found = official(policy, board)
-    scores = np.array([official_run(policy, board, seed)[1]["score"] for seed in range(0, 35, 7)])
-    assert found["draws"]["count"] == 35
+    scores = np.array([official_run(policy, board, seed)[1]["score"] for seed in range(0, 70, 14)])
+    assert found["draws"]["count"] == 70
     assert not found["diverged"]
     low, high = found["draws"]["interval"]
     error = (high - low) / 2 / 1.96
     assert found["score"] == pytest.approx((low + high) / 2)
-    assert error == pytest.approx(found["draws"]["std"] / np.sqrt(35))
-    assert abs(found["score"] - scores.mean()) < 4 * error * np.sqrt(7)
+    assert error == pytest.approx(found["draws"]["std"] / np.sqrt(70))
+    assert abs(found["score"] - scores.mean()) < 4 * error * np.sqrt(14)
     assert found["score"] == pytest.approx(found["criteria"]["uptime"] / 5.0)
     assert nominal(policy, board.task).uptime.shape == (board.task.repeats,)
     c, stands = imperfect(policy, board.task, jax.random.key(1), 3)

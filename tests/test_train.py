@@ -124,7 +124,8 @@ def test_a_run_killed_again_and_again_ends_as_one_that_never_was(whole_run):
     moments = [
         (reached("imitation", 1, writing=True), signal.SIGKILL),
         (reached("sac", 4), signal.SIGINT),
-        (reached("snes", 2, writing=True), signal.SIGKILL),
+        (reached("sac", 9, writing=True), signal.SIGKILL),
+        (reached("snes", 2), signal.SIGKILL),
     ]
     said = []
     for until, signum in moments:
@@ -149,7 +150,7 @@ def test_a_run_killed_again_and_again_ends_as_one_that_never_was(whole_run):
         _, err = process.communicate()
     said.append(err)
     assert process.returncode == 0, err
-    for text, stage in zip(said[2:], ["SAC", "SNES"], strict=True):
+    for text, stage in zip(said[2:], ["SAC", "SAC", "SNES"], strict=True):
         assert f"resuming {folder} in {stage} at " in text
     assert rows_of(folder) == rows_of(whole)
     assert result_of(folder) == result_of(whole)
