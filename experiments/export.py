@@ -2,7 +2,8 @@
 
     python experiments/export.py
 
-Each is given the measurements of a closed loop of 10 s from hanging, 5000 of them. Written with
+Each is given the measurements of a closed loop of 10 s from hanging, 5000 of them, and 10 000
+random states: a hundred runs of a hundred, that have nothing to do with a motion. Written with
 gcc -O2 for C, ONNX Runtime with one thread, and jax compiled on the CPU in a loop of its own.
 """
 
@@ -19,7 +20,7 @@ import numpy as np
 import onnxruntime
 
 from jaxpend import load_policy, rollout
-from jaxpend.boards import v2
+from jaxpend.boards import named_board, v2
 from jaxpend.controllers.catalogue import build
 from jaxpend.controllers.guard import guard
 from jaxpend.controllers.policy import Policy, network_in
@@ -55,93 +56,112 @@ CONTROLLERS = {
     "pendubot, as it ships (guarded)": lambda: load_policy("pendubot"),
     "acrobot, as it ships (guarded)": lambda: load_policy("acrobot"),
     "guard around the history": lambda: guard(with_history(), "pendubot"),
+    "acrobot, for real robots": lambda: load_policy("hardware_acrobot"),
     "TVLQR, guarded": lambda: build("tvlqr_guarded", v2("pendubot").task.plant, "pendubot"),
 }
 
 
 def again(controller, times, states):
-    """Torques (N, 2) of the controller itself, compiled once more with its arrays as constants."""
+    """Torques (..., N, 2) of the controller itself, compiled once more, its arrays constants."""
 
-    def run(now):
+    def run(states):
         start = controller.reset(jax.random.key(0))
-        return jax.lax.scan(lambda carry, now: controller(carry, *now), start, now)[1]
+        return jax.lax.scan(lambda carry, now: controller(carry, *now), start, (times, states))[1]
 
-    return jax.jit(run)((times, states))
+    runs = states.reshape(-1, *states.shape[-2:])
+    return np.asarray(jax.jit(jax.vmap(run))(runs)).reshape(*states.shape[:-1], 2)
 
 
-def in_c(controller, times, states, precision="float32"):
-    """Torques (N, 2), and ns a step."""
-    pointer = ctypes.POINTER(ctypes.c_float)
-    arrays = [np.ascontiguousarray(a, "f4") for a in (times, states, np.zeros((len(times), 2)))]
+def in_c(controller, precision, given):
+    """For each (times, states) of ``given`` torques (..., N, 2), and ns of a step of the first."""
+    real, dtype = ("double", "f8") if precision == "float64" else ("float", "f4")
+    pointer = ctypes.POINTER(ctypes.c_double if precision == "float64" else ctypes.c_float)
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "controller.h").write_text(c.source(controller, precision=precision))
-        (Path(folder) / "main.c").write_text(MAIN)
+        (Path(folder) / "main.c").write_text(MAIN.replace("float", real))
         flags = "-std=c99 -Wall -Werror -O2 -shared -fPIC main.c -o main.so -lm"
         subprocess.run(["gcc", *flags.split()], cwd=folder, check=True)
         run = ctypes.CDLL(str(Path(folder) / "main.so")).run
-    taken = []
-    for _ in range(REPEAT):
-        start = time.perf_counter()
-        run(len(times), *(a.ctypes.data_as(pointer) for a in arrays))
-        taken.append((time.perf_counter() - start) / len(times))
-    return arrays[2], 1e9 * min(taken)
+    found, taken = [], []
+    for times, states in given:
+        times, states = np.ascontiguousarray(times, dtype), np.ascontiguousarray(states, dtype)
+        torques = np.zeros((*states.shape[:-1], 2), dtype)
+        for place in np.ndindex(states.shape[:-2]):
+            arrays = [a.ctypes.data_as(pointer) for a in (times, states[place], torques[place])]
+            for _ in range(REPEAT if not found else 1):
+                start = time.perf_counter()
+                run(len(times), *arrays)
+                taken.append((time.perf_counter() - start) / len(times))
+        found.append(torques)
+    return found, 1e9 * min(taken[:REPEAT])
 
 
-def one_by_one(step, times, states):
-    """Torques (N, 2), and us a step, of a function that is called from Python."""
-    taken, torques = [], []
-    for t, x in zip(times, states, strict=True):
-        start = time.perf_counter()
-        torques.append(step(t, x))
-        taken.append(time.perf_counter() - start)
-    return np.array(torques), 1e6 * np.median(taken)
+def one_by_one(start, given):
+    """The same of a function that is called from Python, and us; ``start()`` gives a new one."""
+    found, taken = [], []
+    for times, states in given:
+        torques = np.zeros((*states.shape[:-1], 2))
+        for place in np.ndindex(states.shape[:-2]):
+            step = start()
+            for i, now in enumerate(zip(times, states[place], strict=True)):
+                began = time.perf_counter()
+                torques[(*place, i)] = step(*now)
+                taken.append(time.perf_counter() - began)
+        found.append(torques)
+    return found, 1e6 * np.median(taken[: len(given[0][0])])
 
 
-def session_of(controller, precision):
-    """A step of the ONNX model."""
+def session_of(controller):
+    """Makes steps of the ONNX model, in double."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level, options.intra_op_num_threads = 3, 1
-    content = onnx.model(controller, precision=precision).SerializeToString()
-    session, state = onnxruntime.InferenceSession(content, options), {}
+    session = onnxruntime.InferenceSession(onnx.model(controller).SerializeToString(), options)
 
-    def step(t, x):
-        inputs = {"t": np.asarray(t, precision), "x": x.astype(precision), **state}
-        torque, *after = session.run(None, inputs)
-        state.update({f"s{i}": value for i, value in enumerate(after)})
-        return torque
+    def start():
+        state = {}
 
-    return step
+        def step(t, x):
+            torque, *after = session.run(None, {"t": np.asarray(t), "x": x, **state})
+            state.update({f"s{i}": value for i, value in enumerate(after)})
+            return torque
+
+        return step
+
+    return start
+
+
+def apart(found, wanted):
+    """The largest difference of a torque, in a loop and on random states."""
+    return " and ".join(f"{np.abs(a - b).max():.0e}" for a, b in zip(found, wanted, strict=True))
 
 
 def main() -> None:
     """Print a table in Markdown."""
-    print("| | numpy, float64 | ONNX, float64 | C, mixed | C, float32 | jax again, float32 |")
-    print("|---|---|---|---|---|---|")
+    print("| | numpy | ONNX | C, float64 | C, float32 | C, single | jax again, float32 |")
+    print("|---|---|---|---|---|---|---|")
+    draw = np.random.default_rng(0)
+    random = (0.1 * np.arange(100), draw.normal(size=(100, 100, 4)) * [2, 2, 8, 8])
+    random = tuple(a.astype("f4").astype(float) for a in random)
     for name, make in CONTROLLERS.items():
         robot = "acrobot" if "acrobot" in name else "pendubot"
+        board = named_board(robot, "hardware" if "real" in name else "v2")
         with jax.enable_x64(True):
-            wide = make()
-            run = jax.jit(rollout)(v2(robot).task.plant, wide, jax.random.key(0))
-            t, x, u = (np.asarray(a) for a in (run.t[:-1], run.x_measured, run.u_command))
+            law = make()
+            run = jax.jit(rollout)(board.task.plant, law, jax.random.key(0))
+            loop = (run.t[:-1], run.x_measured)
+            given = [tuple(np.asarray(a, "f4").astype(float) for a in loop), random]
+            ours = [again(law, *now) for now in given]
             names: dict = {}
-            exec(numpy.source(wide), names)
-            plain, plain_us = one_by_one(names["Controller"]().torque, t, x)
-            model, model_us = one_by_one(session_of(wide, "float64"), t, x)
-            rounded = t.astype("f4").astype(float), x.astype("f4").astype(float)
-            exact, _ = one_by_one(names["Controller"]().torque, *rounded)
-            mixed, mixed_ns = in_c(wide, t, x, "mixed")
-        narrow = jax.jit(rollout)(v2(robot).task.plant, make(), jax.random.key(0))
-        t, x = np.asarray(narrow.t[:-1]), np.asarray(narrow.x_measured)
-        short, short_ns = in_c(make(), t, x)
-        ours = again(make(), t, x)
-        far = [np.abs(a - b).max() for a, b in ((plain, u), (model, u), (mixed, exact))]
-        far += [np.abs(np.asarray(a) - narrow.u_command).max() for a in (short, ours)]
-        print(
-            f"| {name} | {far[0]:.1e} N m, {plain_us:.0f} us | {far[1]:.1e} N m, {model_us:.0f} us "
-            f"| {far[2]:.1e} N m, {mixed_ns:.0f} ns | {far[3]:.1e} N m, {short_ns:.0f} ns "
-            f"| {far[4]:.1e} N m |",
-            flush=True,
-        )
+            exec(numpy.source(law), names)
+            cells = [
+                (*one_by_one(lambda made=names["Controller"]: made().torque, given), "us"),
+                (*one_by_one(session_of(law), given), "us"),
+                *((*in_c(law, p, given), "ns") for p in ("float64", "float32", "single")),
+            ]
+        short = [tuple(jnp.asarray(a, "f4") for a in now) for now in given]
+        cells = [f"{apart(found, ours)} N m, {t:.0f} {unit}" for found, t, unit in cells]
+        cells += [f"{apart([again(make(), *now) for now in short], ours)} N m"]
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import pytest
 from conftest import refused, task_of
 
 from jaxpend import cli, load_policy, rollout
+from jaxpend.boards import HARDWARE
 from jaxpend.config import ACTIVATIONS
 from jaxpend.controller import Feedback
 from jaxpend.controllers.callback import PythonLaw
@@ -109,20 +110,42 @@ def test_the_loop_that_an_exported_controller_closes_is_the_same(tmp_path):
         np.testing.assert_allclose(run.u_command, torques[0], rtol=0, atol=1e-8)
 
 
-def in_c(name, folder, precision="float32"):
+def in_c(name, folder, precision):
+    """As ``compiled``, of one of ``NAMES``."""
+    arrays = "float32" if precision == "single" else "float64"
+    return compiled(controller(name, arrays), folder, precision)
+
+
+def compiled(law, folder, precision):
     """A library whose ``run`` takes a number of steps N, times, states (N, 4), torques (N, 2).
 
     Its ``act`` is one step after ``begin``.
     """
-    arrays = "float32" if precision == "float32" else "float64"
-    text = to_c.source(controller(name, arrays), prefix="our", precision=precision)
-    (folder / "controller.h").write_text(text)
-    real = "double" if precision == "float64" else "float"
-    (folder / "loop.c").write_text(LOOP.replace("float", real))
+    folder.mkdir(exist_ok=True)
+    (folder / "controller.h").write_text(to_c.source(law, prefix="our", precision=precision))
+    (folder / "loop.c").write_text(LOOP.replace("float", OF_C[precision][0]))
     flags = "-std=c99 -Wall -Wextra -Werror -O2 -shared -fPIC loop.c -o loop.so -lm"
     subprocess.run(["gcc", *flags.split()], cwd=folder, check=True)
     return ctypes.CDLL(str(folder / "loop.so"))
 
+
+def run_in_c(library, precision, times, states):
+    """Torques (..., N, 2) for times (N,) and measurements (..., N, 4), each run from the start."""
+    _, dtype, kind = OF_C[precision]
+    times, states = np.ascontiguousarray(times, dtype), np.ascontiguousarray(states, dtype)
+    torques = np.empty((*states.shape[:-1], 2), dtype)
+    for place in np.ndindex(states.shape[:-2]):
+        arrays = (times, states[place], torques[place])
+        library.run(len(times), *(floats(array, kind) for array in arrays))
+    return torques
+
+
+# Of a precision: the type of what goes in and out, in C, numpy and ctypes.
+OF_C = {
+    "float32": ("float", "f4", ctypes.c_float),
+    "float64": ("double", "f8", ctypes.c_double),
+    "single": ("float", "f4", ctypes.c_float),
+}
 
 LOOP = """
 #include "controller.h"
@@ -145,33 +168,47 @@ def floats(array, kind=ctypes.c_float):
 @pytest.mark.parametrize("name", NAMES)
 def test_c_in_double_gives_the_same_torques_on_the_same_measurements(name, tmp_path):
     times, states, torques = recorded(name, "float64")
-    library, states = in_c(name, tmp_path, "float64"), np.ascontiguousarray(states)
-    found = np.empty(torques.shape)
-    for x, u in zip(states, found, strict=True):
-        library.run(len(times), *(floats(a, ctypes.c_double) for a in (times, x, u)))
+    found = run_in_c(in_c(name, tmp_path, "float64"), "float64", times, states)
     np.testing.assert_allclose(found, torques, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_c_in_mixed_precision_gives_the_same_torques_on_the_same_floats(name, tmp_path):
+def test_c_in_float_gives_the_same_torques_on_the_same_floats(name, tmp_path):
+    """Pairs of floats, so that an observer does not multiply their rounding."""
     times, states, _ = recorded(name, "float64")
-    times, states = times.astype("f4"), np.ascontiguousarray(states, "f4")
-    library, found = in_c(name, tmp_path, "mixed"), np.empty((*states.shape[:2], 2), "f4")
-    for x, u in zip(states, found, strict=True):
-        library.run(len(times), floats(times), floats(x), floats(u))
-    ours = [replayed(in_numpy(name), times.astype(float), x.astype(float)) for x in states]
-    np.testing.assert_allclose(found, ours, rtol=0, atol=1e-5)
+    times, states = times.astype("f4").astype(float), states.astype("f4").astype(float)
+    found = run_in_c(in_c(name, tmp_path, "float32"), "float32", times, states)
+    ours = [replayed(in_numpy(name), times, x) for x in states]
+    np.testing.assert_allclose(found, ours, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_c_is_as_close_as_float32_is(name, tmp_path):
+def test_random_states_give_the_same_torques(name, tmp_path):
+    """A hundred measurements in a hundred runs of 10 s, that have nothing to do with a motion."""
+    draw = np.random.default_rng(5)
+    states = (draw.normal(size=(100, 100, 4)) * [2, 2, 8, 8]).astype("f4").astype(float)
+    times = (0.1 * np.arange(100)).astype("f4").astype(float)
+    with jax.enable_x64(True):
+        ours = np.asarray(again(controller(name, "float64"), times, states))
+    assert np.ptp(ours[..., 0]) > 1
+    exported = in_numpy(name)
+    found = np.array([replayed(exported, times, x) for x in states])
+    np.testing.assert_allclose(found, ours, rtol=0, atol=1e-9)
+    for precision, tolerance in (("float32", 1e-6), ("float64", 1e-9)):
+        found = run_in_c(in_c(name, tmp_path / precision, precision), precision, times, states)
+        np.testing.assert_allclose(found, ours, rtol=0, atol=tolerance)
+    session = in_onnx(controller(name, "float64"))
+    for x, wanted in zip(states[:10], ours[:10], strict=True):
+        found = run_in_onnx(session, times, x)
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_c_with_one_float_a_number_is_as_close_as_float32_is(name, tmp_path):
     """An observer takes the difference of angles, and multiplies their rounding."""
     times, states, exact = recorded(name, "float64")
-    times, states = times.astype("f4"), np.ascontiguousarray(states, "f4")
-    library = in_c(name, tmp_path)
-    torques = np.empty(exact.shape, "f4")
-    for x, u in zip(states, torques, strict=True):
-        library.run(len(times), floats(times), floats(x), floats(u))
+    times, states = times.astype("f4"), states.astype("f4")
+    torques = run_in_c(in_c(name, tmp_path, "single"), "single", times, states)
     if name in ("plain", "history"):
         ours = np.asarray(again(controller(name, "float32"), times, states))
         np.testing.assert_allclose(torques, ours, rtol=0, atol=1e-5)
@@ -196,35 +233,108 @@ def again(controller, times, states):
     return jax.vmap(run)(states)
 
 
-def test_the_header_needs_no_more_than_it_says(tmp_path):
-    made = controller("guarded history", "float32")
-    text = to_c.source(made, prefix="our", precision="float32")
-    called = set(re.findall(r"\b(\w+f)\(", text)) | set(re.findall(r"\b(\w*alloc\w*)\(", text))
-    assert called == {"tanhf"}
+@pytest.mark.parametrize(("precision", "called"), [("single", {"tanhf"}), ("float32", {"fmaf"})])
+def test_the_header_needs_no_more_than_it_says(tmp_path, precision, called):
+    text = to_c.source(controller("guarded history", "float64"), prefix="our", precision=precision)
+    assert set(re.findall(r"\b(\w+f)\(", text)) == called  # fmaf where it is an instruction
     assert "double" not in text
+    assert "alloc" not in text
     operations = int(re.search(r"at most (\d+) operations", text)[1])
-    assert 500 < operations < 3000
+    assert (2_000 if precision == "single" else 20_000) < operations < 60_000
     main = 'int main(void) { printf("%d", (int)sizeof(our_state)); }'
     (tmp_path / "size.c").write_text(f'#include "our.h"\n#include <stdio.h>\n{main}')
     (tmp_path / "our.h").write_text(text)
-    subprocess.run(["gcc", "size.c", "-o", "size"], cwd=tmp_path, check=True)
+    subprocess.run(["gcc", "size.c", "-o", "size", "-lm"], cwd=tmp_path, check=True)
     size = subprocess.run([tmp_path / "size"], capture_output=True, text=True, check=True).stdout
     assert f"The state has {size} bytes" in text
+    fast = ["gcc", "-ffast-math", "size.c", "-o", "size", "-lm"]
+    done = subprocess.run(fast, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode
+    assert "compile this file without -ffast-math" in done.stderr
+
+
+POINTS = np.array([
+    *np.linspace(-9, 9, 181), 1e-9, -1e-9, 1e-20, 0.0, 100.0, -100.0, 1234.5678, 1e5 + 0.3, -3e4,
+])  # fmt: skip
+FUNCTIONS = {
+    "sin": np.sin, "cos": np.cos, "tanh": np.tanh, "exp": np.exp, "log": np.log,
+    "sqrt": np.sqrt, "arctan": np.arctan, "floor": np.floor, "ceil": np.ceil, "rint": np.rint,
+}  # fmt: skip
+
+
+def test_pairs_of_floats_are_far_closer_than_float_is(tmp_path):
+    """A float has 6e-8 of a number; a loss of that in any function would be seen here."""
+    with np.errstate(all="ignore"):
+        exact = np.stack([function(POINTS) for function in FUNCTIONS.values()])
+        exact = np.concatenate([exact, [np.fmod(POINTS, 2.7654), POINTS / 3, POINTS**2]])
+        known = np.isfinite(exact) & (np.abs(exact) < 1e30)
+    sizes = np.where(known, np.maximum(np.abs(exact), np.maximum(np.abs(POINTS) / 30, 1e-3)), 1.0)
+
+    def law(t, x):
+        i = jnp.asarray(t, int)
+        a = jnp.asarray(POINTS)[i]
+        found = [getattr(jnp, name)(a) for name in FUNCTIONS]
+        found = jnp.stack([*found, jax.lax.rem(a, 2.7654), a / 3, a * a])
+        which = jnp.asarray(known)[:, i]
+        off = jnp.where(which, (found - jnp.asarray(exact)[:, i]) / jnp.asarray(sizes)[:, i], 0.0)
+        finite = jnp.sum(jnp.where(jnp.isfinite(found), 1.0, 0.0))
+        return jnp.stack([1e9 * jnp.max(jnp.abs(off)), finite])
+
+    with jax.enable_x64(True):
+        library = compiled(Feedback(law), tmp_path, "float32")
+    places = np.arange(len(POINTS), dtype=float)
+    found = run_in_c(library, "float32", places, np.zeros((len(POINTS), 4)))
+    np.testing.assert_array_less(found[:, 0], 1)  # 1e-9 of each
+    np.testing.assert_array_equal(found[:, 1], np.sum(np.abs(exact) < 3e38, axis=0))
+
+
+@pytest.mark.parametrize("robot", ["acrobot", "pendubot"])
+def test_what_ships_for_real_robots_is_exported(robot, tmp_path):
+    """A memory of 40 steps, and an observer of a plant with Coulomb friction."""
+    task = HARDWARE[robot].task
+    draw = np.random.default_rng(6)
+    times = 0.002 * np.arange(300)
+    states = (np.cumsum(draw.normal(size=(2, 300, 4)), 1) * [0.02, 0.02, 0.2, 0.2]).astype("f4")
+    with jax.enable_x64(True):
+        alone = load_policy(task.shipped)
+        for law in (alone, guard(alone, robot, task.plant)):
+            ours = np.asarray(again(law, times, states.astype(float)))
+            assert np.ptp(ours) > 1
+            names: dict = {}
+            exec(to_numpy.source(law), names)
+            exported = names["Controller"]()
+            found = [replayed(exported, times, x) for x in states.astype(float)]
+            np.testing.assert_allclose(found, ours, rtol=0, atol=1e-9)
+            found = run_in_onnx(in_onnx(law), times[:100], states[0, :100].astype(float))
+            np.testing.assert_allclose(found, ours[0, :100], rtol=0, atol=1e-9)
+            folder = tmp_path / type(law).__name__
+            found = run_in_c(compiled(law, folder, "float32"), "float32", times, states)
+            np.testing.assert_allclose(found, ours, rtol=0, atol=1e-5)
+
+
+def in_onnx(law):
+    """A session of ONNX Runtime, in double."""
+    runtime = pytest.importorskip("onnxruntime")
+    options = runtime.SessionOptions()
+    options.log_severity_level, options.intra_op_num_threads = 3, 1
+    return runtime.InferenceSession(to_onnx.model(law).SerializeToString(), options)
+
+
+def run_in_onnx(session, times, states):
+    """Torques (N, 2) for times (N,) and measurements (N, 4)."""
+    state, torques = {}, []
+    for t, x in zip(times, states, strict=True):
+        torque, *after = session.run(None, {"t": np.asarray(t), "x": x, **state})
+        state = {f"s{i}": value for i, value in enumerate(after)}
+        torques.append(torque)
+    return np.array(torques)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_onnx_gives_the_same_torques_on_the_same_measurements(name):
-    runtime = pytest.importorskip("onnxruntime")
     times, states, torques = recorded(name, "float64")
-    model = to_onnx.model(controller(name, "float64"), precision="float64")
-    options = runtime.SessionOptions()
-    options.log_severity_level, options.intra_op_num_threads = 3, 1
-    session = runtime.InferenceSession(model.SerializeToString(), options)
-    state: dict = {}
-    for t, x, u in zip(times[:1500], states[1], torques[1], strict=False):
-        torque, *after = session.run(None, {"t": np.asarray(t), "x": x, **state})
-        state = {f"s{i}": value for i, value in enumerate(after)}
-        np.testing.assert_allclose(torque, u, rtol=0, atol=1e-9)
+    found = run_in_onnx(in_onnx(controller(name, "float64")), times[:1500], states[1, :1500])
+    np.testing.assert_allclose(found, torques[1, :1500], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["riccati", "open_loop", "pd"])
@@ -270,34 +380,28 @@ def everything(t, x):
         jax.lax.cond(x[0] > 0, lambda: x[1] ** 3, lambda: x[2] ** -2),
         jax.lax.fori_loop(0, 3, lambda i, v: v * 0.5 + x[i], 1.0),
         jnp.sum(jnp.pad(x, 2)[1:5] * jnp.roll(x, 1)) + jnp.sum(jnp.rint(2 * wide)),
-        jnp.where(jnp.isfinite(x[0] / (x[1] - x[1])), 1.0, -1.0),
+        jnp.where(jnp.isfinite(x[0] / (x[1] - x[1])), 1.0, -1.0) + jnp.arctan(x[2]),
+        jnp.sum(jnp.cumsum(wide, axis=0)[3:] * jnp.cumsum(wide.ravel())[::-2][:4]),
+        jnp.sum(jax.lax.cumsum(wide, axis=1, reverse=True)[:, 1]),
     ]
     total = jnp.array(sums)
-    return jnp.array([total.sum(), jnp.dot(total, jnp.arange(10.0))])
+    return jnp.array([total.sum(), jnp.dot(total, jnp.arange(12.0))])
 
 
 def test_every_printer_prints_every_operation(tmp_path):
     law, draw = Feedback(everything), np.random.default_rng(1)
     times, states = draw.uniform(0, 9, 50), draw.normal(size=(50, 4)) * 3
+    times, states = times.astype("f4").astype(float), states.astype("f4").astype(float)
     with jax.enable_x64(True):
         expected = np.asarray(again(law, times, states[None])[0])
-        session = pytest.importorskip("onnxruntime").InferenceSession(
-            to_onnx.model(law, precision="float64").SerializeToString()
-        )
     names: dict = {}
     exec(to_numpy.source(law, class_name="Own"), names)
     np.testing.assert_allclose(replayed(names["Own"](), times, states), expected, rtol=1e-9)
-    for t, x, u in zip(times, states, expected, strict=True):
-        np.testing.assert_allclose(
-            session.run(["torque"], {"t": np.asarray(t), "x": x})[0], u, rtol=1e-9
-        )
-    (tmp_path / "controller.h").write_text(to_c.source(law, prefix="our", precision="float32"))
-    (tmp_path / "loop.c").write_text(LOOP)
-    flags = "-std=c99 -Wall -Werror -O2 -shared -fPIC loop.c -o loop.so -lm"
-    subprocess.run(["gcc", *flags.split()], cwd=tmp_path, check=True)
-    t, x, u = times.astype("f4"), states.astype("f4"), np.empty((50, 2), "f4")
-    ctypes.CDLL(str(tmp_path / "loop.so")).run(50, floats(t), floats(x), floats(u))
-    np.testing.assert_allclose(u, expected, rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(run_in_onnx(in_onnx(law), times, states), expected, rtol=1e-9)
+    for precision, tolerance in (("float32", 1e-6), ("float64", 1e-9), ("single", 2e-3)):
+        library = compiled(law, tmp_path / precision, precision)
+        found = run_in_c(library, precision, times, states)
+        np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance)
 
 
 def test_what_is_not_finite_passes_through():
@@ -365,27 +469,38 @@ def test_the_command_writes_a_file_that_it_may_write_again(monkeypatch, capsys, 
     assert (tmp_path / name).read_text() == MINE
 
 
-def test_the_command_exports_in_either_precision(monkeypatch, capsys, tmp_path):
+def test_the_command_exports_in_every_precision(monkeypatch, capsys, tmp_path):
     save_policy(tmp_path / "policy.npz", policy(0))
-    line = ["export", str(tmp_path / "policy.npz"), "--precision"]
-    for precision, kind, number in (("float32", "float", 1), ("float64", "double", 11)):
-        for to in ("c", "onnx"):
-            out = ["--to", to, "--out", str(tmp_path / f"{precision}.{to}")]
-            assert run(monkeypatch, capsys, [*line, precision, *out])[0] == 0
-        said = (tmp_path / f"{precision}.c").read_text()
-        assert f"_step({precision}_state *s, {kind} t, const {kind} x[4]" in said
-        graph = onnx.load_model(tmp_path / f"{precision}.onnx").graph
-        assert {i.type.tensor_type.elem_type for i in graph.input} == {number}
+
+    def export(to, *more):
+        line = ["export", str(tmp_path / "policy.npz"), "--to", to, "--out", str(tmp_path / "a")]
+        found = run(monkeypatch, capsys, [*line, *more])
+        text = (tmp_path / "a").read_bytes() if (tmp_path / "a").is_file() else b""
+        (tmp_path / "a").unlink(missing_ok=True)
+        return found, text
+
+    c, numbers = export("c")[1].decode(), {}
+    assert "a_step(a_state *s, float t, const float x[4]" in c
+    for precision, kind in (("float32", "float"), ("float64", "double"), ("single", "float")):
+        (code, _, _), text = export("c", "--precision", precision)
+        assert code == 0
+        assert f"a_step(a_state *s, {kind} t, const {kind} x[4]" in text.decode()
+        assert (text.decode() == c) == (precision == "float32")
+    for more, number in (
+        ((), 11),
+        (("--precision", "float64"), 11),
+        (("--precision", "float32"), 1),
+    ):
+        graph = onnx.load_from_string(export("onnx", *more)[1]).graph
+        numbers = {i.type.tensor_type.elem_type for i in graph.input}
+        assert numbers == {number}
     for to in ("numpy", "realaigym"):
-        out = ["--to", to, "--out", str(tmp_path / to)]
-        code, _, said = run(monkeypatch, capsys, [*line, "float32", *out])
-        assert code == 2
-        assert f"--precision is float32; {to} computes in float64" in said
-    code, _, said = run(monkeypatch, capsys, [*line, "mixed", "--to", "onnx", "--out", "x.onnx"])
-    assert (code, "onnx computes in float32 or float64" in said) == (2, True)
-    mixed = [*line, "mixed", "--to", "c", "--out", str(tmp_path / "mixed.h")]
-    assert run(monkeypatch, capsys, mixed)[0] == 0
-    assert "mixed_step(mixed_state *s, float t, const" in (tmp_path / "mixed.h").read_text()
+        (code, _, said), text = export(to, "--precision", "float32")
+        assert (code, text) == (2, b"")
+        assert f"--precision is float32; {to} computes in float64 alone: leave it out" in said
+    (code, _, said), text = export("onnx", "--precision", "single")
+    assert (code, text) == (2, b"")
+    assert "--precision is single; onnx computes in float64 or float32" in said
 
 
 def run(monkeypatch, capsys, arguments):

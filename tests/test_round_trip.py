@@ -80,7 +80,7 @@ def test_onnx(policy, wanted):
 
 
 def test_c(policy, wanted, tmp_path):
-    (tmp_path / "policy.h").write_text(to_c.source(policy, prefix="policy", precision="float32"))
+    (tmp_path / "policy.h").write_text(to_c.source(policy, prefix="policy"))
     (tmp_path / "main.c").write_text(
         '#include "policy.h"\n'
         "void torque(const float *x, float *u)\n"

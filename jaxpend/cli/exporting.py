@@ -12,6 +12,10 @@ __all__ = ["export"]
 # Near the start of every file that is written here, and of no other that names this package.
 MARK = re.compile(rb"; jaxpend\.interop\.\w+ wrote it|; see jaxpend\.interop\.onnx\.")
 START = 400  # bytes
+PRECISIONS = {  # the first unless told
+    "numpy": ("float64",), "realaigym": ("float64",), "onnx": ("float64", "float32"),
+    "c": ("float32", "float64", "single"),
+}  # fmt: skip
 
 
 def export(
@@ -19,7 +23,7 @@ def export(
     /,
     to: Literal["numpy", "onnx", "c", "realaigym"],
     out: Path,
-    precision: Literal["float32", "float64", "mixed"] | None = None,
+    precision: Literal["float32", "float64", "single"] | None = None,
 ) -> None:
     """A policy or controller as a file for where there is no jax.
 
@@ -33,16 +37,15 @@ def export(
             c, a header without allocation; realaigym, a submission to its boards in numpy, with
             what they measure, which takes a while.
         out: file to write; for realaigym a folder, whose name the submission has.
-        precision: float64 unless told, for torques within 1e-9 N m of those here; mixed, for c:
-            float goes in and comes out, double computes, within 1e-5; float32, for a processor
-            that has nothing else: a guard's observer multiplies rounding, so that it is within
-            3e-3 there. numpy has float64 alone.
+        precision: of c float32 unless told, which computes with pairs of floats, for torques within
+            1e-5 N m of those here; float64, within 1e-9; single, one float for a number, the
+            fastest: a guard's observer multiplies rounding, so that it is within 3e-3 there. Of
+            onnx float64 unless told, or float32, as close as single. numpy has float64 alone.
     """
-    if to in ("numpy", "realaigym") and precision not in (None, "float64"):
-        text = f"--precision is {precision}; {to} computes in float64 alone: leave it out"
-        raise JaxpendError(f"{text}, or export to onnx or c")
-    if to == "onnx" and precision == "mixed":
-        raise JaxpendError("--precision is mixed; onnx computes in float32 or float64")
+    chosen = precision or PRECISIONS[to][0]
+    if chosen not in PRECISIONS[to]:
+        text = f"--precision is {precision}; {to} computes in {' or '.join(PRECISIONS[to])}"
+        raise JaxpendError(f"{text}{'' if to == 'onnx' else ' alone: leave it out'}")
     if to == "realaigym":
         return _submit(policy, out)
     _check_out(out)
@@ -51,10 +54,9 @@ def export(
     from ..controllers.files import load_controller
     from ..terminal import console
 
-    precision = precision or "float64"
-    with jax.enable_x64(precision != "float32"):
+    with jax.enable_x64(True):
         controller = load_controller(policy)
-    content = _content(controller, to, out, precision)
+    content = _content(controller, to, out, chosen)
     from ..files import write_atomically
 
     write_atomically(out, content)

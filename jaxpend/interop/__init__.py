@@ -7,5 +7,6 @@ runs; ``numpy``, ``onnx``, ``c`` and ``realaigym`` write a controller for where 
 Those four print one thing, a ``program``: one step of the controller as plain arithmetic.
 ``trace`` makes it. It lets jax record the step as a list of primitive operations, ``translate``
 goes through that list, and ``rules`` says what each primitive becomes, with ``sums`` for those
-that combine many entries into one. What no rule is for is refused, for all printers alike.
+that combine many entries into one. What no rule is for is refused, for all printers alike. ``c``
+prints in several kinds of ``arithmetic``, one of which is ``pairs`` of floats.
 """

@@ -25,9 +25,10 @@ SCALAR = {
     "idiv": "_idiv({}, {})", "rem": "_rem({}, {})", "neg": "-{}", "abs": "abs({})", "max": MAX,
     "min": MIN, "sign": "_sign({})", "floor": "_floor({})", "ceil": "-_floor(-{})",
     "round": "_round({})", "sqrt": "_sqrt({})", "exp": "_exp({})", "log": "_log({})",
-    "sin": "_sin({})", "cos": "_cos({})", "tanh": "math.tanh({})", "finite": "math.isfinite({})",
-    "lt": "{} < {}", "le": "{} <= {}", "gt": "{} > {}", "ge": "{} >= {}", "eq": "{} == {}",
-    "ne": "{} != {}", "and": "{} and {}", "or": "{} or {}", "not": "not {}",
+    "sin": "_sin({})", "cos": "_cos({})", "tanh": "math.tanh({})", "atan": "math.atan({})",
+    "finite": "math.isfinite({})", "lt": "{} < {}", "le": "{} <= {}", "gt": "{} > {}",
+    "ge": "{} >= {}", "eq": "{} == {}", "ne": "{} != {}", "and": "{} and {}",
+    "or": "{} or {}", "not": "not {}",
     "select": "{1} if {0} else {2}", "int": "_int({})", "float": "float({})", "bool": "{} != 0",
 }  # fmt: skip
 VECTOR = SCALAR | {
@@ -35,7 +36,8 @@ VECTOR = SCALAR | {
     "abs": "np.abs({})", "max": "np.maximum({}, {})", "min": "np.minimum({}, {})",
     "sign": "np.sign({})", "floor": "np.floor({})", "ceil": "np.ceil({})", "round": "np.rint({})",
     "sqrt": "np.sqrt({})", "exp": "np.exp({})", "log": "np.log({})", "sin": "np.sin({})",
-    "cos": "np.cos({})", "tanh": "np.tanh({})", "finite": "np.isfinite({})",
+    "cos": "np.cos({})", "tanh": "np.tanh({})", "atan": "np.arctan({})",
+    "finite": "np.isfinite({})",
     "and": "np.logical_and({}, {})", "or": "np.logical_or({}, {})", "not": "np.logical_not({})",
     "select": "np.where({}, {}, {})", "int": "_ints({})", "float": "np.asarray({}, float)",
 }  # fmt: skip
@@ -201,6 +203,8 @@ def _expression(node: Node, names: dict[Node, str]) -> str:
     if node.op in ROWS:
         m, k = node.value
         return f"{args[0]}.reshape({m}, {k}).{ROWS[node.op]}(1)"
+    if node.op == "sums":
+        return f"{args[0]}.reshape{node.value}.cumsum(1).ravel()"
     if node.op == "pack":
         return f"np.array([{', '.join(args)}])"
     if node.op == "concat":

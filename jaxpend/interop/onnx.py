@@ -31,8 +31,9 @@ OPERATORS = {
     "add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "neg": "Neg", "abs": "Abs",
     "max": "Max", "min": "Min", "sign": "Sign", "floor": "Floor", "ceil": "Ceil",
     "round": "Round", "sqrt": "Sqrt", "exp": "Exp", "log": "Log", "sin": "Sin", "cos": "Cos",
-    "tanh": "Tanh", "lt": "Less", "le": "LessOrEqual", "gt": "Greater", "ge": "GreaterOrEqual",
-    "eq": "Equal", "and": "And", "or": "Or", "not": "Not", "select": "Where",
+    "tanh": "Tanh", "lt": "Less", "le": "LessOrEqual", "gt": "Greater",
+    "ge": "GreaterOrEqual", "eq": "Equal", "and": "And", "or": "Or", "not": "Not",
+    "select": "Where",
 }  # fmt: skip
 ROWS = {"total": "ReduceSum", "largest": "ReduceMax", "smallest": "ReduceMin"}
 
@@ -168,6 +169,10 @@ class _Graph:
         if node.op in ROWS:
             rows = self.put("Reshape", [args[0], self.numbers(node.value)])
             return self.put(ROWS[node.op], [rows, self.numbers([1])], keepdims=0)
+        if node.op == "sums":
+            rows = self.put("Reshape", [args[0], self.numbers(node.value)])
+            sums = self.put("CumSum", [rows, self.numbers(1)])
+            return self.put("Reshape", [sums, self.numbers([node.size])])
         return self.composed(node, args)
 
     def product(self, node: Node) -> str:
@@ -182,12 +187,25 @@ class _Graph:
         product = self.put("MatMul", factors)
         return self.put("Reshape", [product, self.numbers([m * n])])
 
+    def arctangent(self, args: list[str]) -> str:
+        """Of a float, and one step from it towards that of ``args``: runtimes have no other."""
+        short = self.put("Atan", [self.put("Cast", args, to=1)])
+        first = self.put("Cast", [short], to=self.tensors["float"])
+        sin, cos = self.put("Sin", [first]), self.put("Cos", [first])
+        # tan(a - b) = (tan a - tan b) / (1 + tan a tan b)
+        above = self.put("Sub", [self.put("Mul", [*args, cos]), sin])
+        below = self.put("Add", [cos, self.put("Mul", [*args, sin])])
+        better = self.put("Add", [first, self.put("Div", [above, below])])
+        return self.put("Where", [self.put("IsInf", args), first, better])
+
     def composed(self, node: Node, args: list[str]) -> str:
         """What ONNX has no operator of its own for."""
         if node.op == "ne":
             return self.put("Not", [self.put("Equal", args)])
         if node.op == "rem":
             return self.put("Mod", args, fmod=1)
+        if node.op == "atan":
+            return self.arctangent(args)
         if node.op == "finite":
             parts = [self.put("IsInf", args), self.put("IsNaN", args)]
             return self.put("Not", [self.put("Or", parts)])

@@ -12,6 +12,7 @@ either gone or a ``take``. There are no loops and no branches.
     pack, concat          a vector of scalars, a vector of vectors
     matmul                (m, k) times (k, n), both flat; ``value`` is (m, k, n)
     total, largest, smallest   of every row of (m, k), flat; ``value`` is (m, k)
+    sums                  of every row of (m, k) its running sums, (m, k), flat
 """
 
 import dataclasses
@@ -157,7 +158,8 @@ FOLDS: dict[str, Callable] = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "rem": np.fmod,
     "neg": np.negative, "abs": np.abs, "max": np.maximum, "min": np.minimum, "sign": np.sign,
     "floor": np.floor, "ceil": np.ceil, "round": np.rint, "sqrt": np.sqrt, "exp": np.exp,
-    "log": np.log, "sin": np.sin, "cos": np.cos, "tanh": np.tanh, "finite": np.isfinite,
+    "log": np.log, "sin": np.sin, "cos": np.cos, "tanh": np.tanh, "atan": np.arctan,
+    "finite": np.isfinite,
     "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal,
     "eq": np.equal, "ne": np.not_equal, "and": np.logical_and, "or": np.logical_or,
     "not": np.logical_not, "select": np.where, "int": _to_int, "float": np.float64,
@@ -258,6 +260,10 @@ class Builder:
     def reduce(self, op: str, a: Node, m: int, k: int) -> Node:
         """``total``, ``largest`` or ``smallest`` of the rows of (m, k)."""
         return self.node(op, (a,), a.kind, m, (m, k))
+
+    def sums(self, a: Node, m: int, k: int) -> Node:
+        """The running sums of the rows of (m, k), which are as many."""
+        return self.node("sums", (a,), a.kind, m * k, (m, k))
 
 
 def _simpler(op: str, args: tuple[Node, ...]) -> Node | None:

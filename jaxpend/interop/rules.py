@@ -21,8 +21,8 @@ SAME = {
     "add": "add", "add_any": "add", "sub": "sub", "mul": "mul", "neg": "neg", "abs": "abs",
     "max": "max", "min": "min", "sign": "sign", "floor": "floor", "ceil": "ceil",
     "sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos", "tanh": "tanh",
-    "is_finite": "finite", "lt": "lt", "le": "le", "gt": "gt", "ge": "ge", "eq": "eq", "ne": "ne",
-    "lt_to": "lt", "le_to": "le",
+    "atan": "atan", "is_finite": "finite", "lt": "lt", "le": "le", "gt": "gt", "ge": "ge",
+    "eq": "eq", "ne": "ne", "lt_to": "lt", "le_to": "le",
 }  # fmt: skip
 # Jaxprs in a jaxpr, and the parameter that holds them.
 CALLS = {

@@ -81,6 +81,12 @@ def position(tr: Translator, a: Array, better: str, axes: Sequence[int], shape: 
 
 def running(tr: Translator, a: Array, op: str, axis: int, reverse: bool) -> Array:
     """As ``reduced`` along one axis, with all that comes before the result: a cumulative sum."""
+    if op == "add" and not a.small:
+        turned = tr.move(a, lambda v: np.moveaxis(np.flip(v, axis) if reverse else v, axis, -1))
+        k = turned.shape[-1]
+        node = tr.build.sums(tr.vector(turned), a.size // max(k, 1), k)
+        back = tr.move(Array(turned.shape, node), lambda v: np.moveaxis(v, -1, axis))
+        return tr.move(back, lambda v: np.flip(v, axis)) if reverse else back
     lines = np.moveaxis(_taken_apart(tr, a), axis, -1)
     found = np.empty(lines.shape, object)
     for line in np.ndindex(lines.shape[:-1]):
