@@ -7,6 +7,7 @@ judges takes one. So training cannot touch official keys or grids, and another b
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -28,6 +29,7 @@ from .criteria import (
 from .errors import JaxpendError, choose
 from .hardware import PRESETS, Spread, draw
 from .plant import Plant, tip_height
+from .pytree import in_default
 from .resets import HOLD, JITTER, Resets, official_resets, random_resets
 from .robots import ROBOTS, active_joint
 from .rollout import Trajectory
@@ -101,13 +103,28 @@ class Task:
         return f"{kind}{self.robot}"
 
     @property
+    def chance(self) -> bool:
+        """Whether chance plays in what the score is of: resets by hand, or robots that differ."""
+        return bool(self.resets or self.spread)
+
+    @property
     def repeats(self) -> int:
         """Runs of which training takes the mean score: one, or several where chance plays."""
-        return TRIALS if self.resets else 1
+        return TRIALS if self.chance else 1
 
     def trial(self, key: jax.Array) -> Scenario:
-        """A scenario that the score is of: the nominal plant, with resets that ``key`` draws."""
-        return self._thrown(Scenario(self.plant), key)
+        """A scenario that the score is of: the nominal plant, with resets that ``key`` draws.
+
+        Of a task with a ``spread`` it is a robot that ``key`` draws, which nobody pushes.
+        """
+        scenario = Scenario(self.plant) if self.spread is None else self.robot_of(key)
+        return self._thrown(scenario, key)
+
+    def robot_of(self, key: jax.Array, plant: Plant | None = None, pushed: Any = False) -> Scenario:
+        """A robot of a task with a ``spread``, around its plant; ``key`` is consumed."""
+        assert self.spread is not None
+        plant = self.plant if plant is None else plant
+        return draw(self.spread, plant, key, pushed=pushed, duration=self.duration)
 
     def sample(self, key: jax.Array, share: float = 1.0) -> Scenario:
         """A trial with random imperfections, in a ``share`` of cases; ``key`` is consumed."""
@@ -122,8 +139,7 @@ class Task:
         if self.spread is None:
             return sample(plant, key, share)
         key_robot, key_pushed = jax.random.split(key)
-        pushed = jax.random.bernoulli(key_pushed, share)
-        return draw(self.spread, plant, key_robot, pushed=pushed, duration=self.duration)
+        return self.robot_of(key_robot, plant, jax.random.bernoulli(key_pushed, share))
 
     def stands(self, x: jax.Array, length: jax.Array | None = None) -> jax.Array:
         """Whether runs, states (..., N, 4), end well: (...) bool.
@@ -210,6 +226,11 @@ def strips(plant: Plant) -> list[Strip]:
     ]
 
 
+@partial(jax.jit, static_argnames="task")
+def _robot(task: Task, seed: int) -> Scenario:
+    return task.robot_of(jax.random.key(seed))
+
+
 @dataclasses.dataclass(frozen=True)
 class Board:
     """A task with its official trials and the rows that are published."""
@@ -231,6 +252,10 @@ class Board:
     def drawn(self, seed: int) -> Scenario | None:
         """The official trial of a seed, in jax's default float type; None: the nominal plant."""
         task, scenario = self.task, Scenario(self.task.plant)
+        if task.spread is not None:
+            with jax.enable_x64(False):  # the same robot in either precision
+                robot = _robot(task, seed)
+            return in_default(robot)
         if not task.resets:
             return None
         plant = scenario.plant  # which is traced in a batch: friction has to be known to be none
@@ -312,6 +337,7 @@ HARDWARE = {
             standing=2.0,
         ),
         trials=None,
+        draws=200,
     )
     for robot in ROBOTS
 }

@@ -101,7 +101,9 @@ def off(scenario: Scenario, nominal: Plant) -> dict[str, jax.Array]:
     assert scenario.delay is not None
     assert scenario.responsiveness is not None
     assert scenario.pulses is not None
-    found |= {"delay": DT * scenario.delay[0], "responsiveness": scenario.responsiveness}
+    assert scenario.delay_jitter is not None
+    found |= {"delay": DT * scenario.delay[0], "jitter": DT * scenario.delay_jitter}
+    found["responsiveness"] = scenario.responsiveness
     return found | {"push": jnp.abs(scenario.pulses.amplitude).max()}
 
 

@@ -33,6 +33,7 @@ class Spread:
     angle_noise: float = 0.0  # rad, largest standard deviation
     velocity_noise: float = 0.1  # rad/s, largest standard deviation
     delay: float = 0.01  # s, longest, of measurements
+    jitter: float = 0.004  # s, longest, by which any measurement comes later still
     torque_noise: float = 0.05  # N m, largest standard deviation
     response: float = 0.8  # least share of a change of the torque that a step makes; 1: all
     push: tuple[float, float] = (0.5, 3.0)  # N m, of a disturbance pulse, where there are pushes
@@ -40,6 +41,7 @@ class Spread:
 
     def __post_init__(self) -> None:
         most_of = {"inertial": 1.0, "friction": 1.0, "response": 1.0, "delay": LONGEST}
+        most_of["jitter"] = LONGEST - self.delay
         for name, most in most_of.items():
             if not 0 <= getattr(self, name) <= most:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be in 0 to {most:g}")
@@ -58,7 +60,8 @@ PRESETS = {
     "wide": Spread(inertial=0.25, friction=1.0),
     "authors": Spread(
         inertial=0.0, friction=0.0, encoder=0.0, filtered=0.0, angle_noise=0.02,
-        velocity_noise=0.02, delay=0.06, torque_noise=0.0, response=0.85, push=(0.4, 0.6),
+        velocity_noise=0.02, delay=0.06, jitter=0.0, torque_noise=0.0, response=0.85,
+        push=(0.4, 0.6),
     ),
 }  # fmt: skip
 
@@ -71,7 +74,7 @@ def draw(spread: Spread, plant: Plant, key: jax.Array, *, pushed: Any, duration:
     keys = dict(zip(("plant", "rest", "pulses"), jax.random.split(key, 3), strict=True))
     parts = jax.random.uniform(keys["plant"], (6, 2), minval=-1.0, maxval=1.0)
     mass, com, length, inertia, damping, coulomb = parts
-    rest = jax.random.uniform(keys["rest"], (6,))
+    rest = jax.random.uniform(keys["rest"], (7,))
     friction = jnp.zeros(2) if plant.coulomb_friction is None else plant.coulomb_friction
     motor = 1 + spread.friction * (2 * rest[0] - 1)
     # Of the inertia, that about the centre of mass is off, and never negative: no body's is. That
@@ -100,6 +103,7 @@ def draw(spread: Spread, plant: Plant, key: jax.Array, *, pushed: Any, duration:
         robot,
         measurement_noise=jnp.stack([angle, angle, speed, speed]),
         delay=jnp.full(4, jnp.round(spread.delay / DT * rest[3]).astype(jnp.int32)),
+        delay_jitter=jnp.round(spread.jitter / DT * rest[6]).astype(jnp.int32),
         torque_noise=spread.torque_noise * rest[4] * (plant.torque_limit > 0),
         responsiveness=spread.response + (1 - spread.response) * rest[5],
         pulses=pulses.replace(amplitude=jnp.where(pushed, pulses.amplitude, 0.0)),

@@ -15,8 +15,9 @@ import dataclasses
 from typing import Any, Self, TypeVar, dataclass_transform
 
 import jax
+import jax.numpy as jnp
 
-__all__ = ["Pytree", "pytree", "static"]
+__all__ = ["Pytree", "in_default", "pytree", "static"]
 
 T = TypeVar("T")
 
@@ -40,3 +41,13 @@ def pytree(cls: type[T]) -> type[T]:
     if not hasattr(cls, "replace"):
         cls.replace = Pytree.replace  # type: ignore[attr-defined]
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
+
+
+def in_default(tree: T) -> T:
+    """A pytree with its floating-point arrays in jax's default float type."""
+
+    def converted(leaf: Any) -> Any:
+        floating = jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+        return jnp.asarray(leaf, jnp.result_type(float)) if floating else leaf
+
+    return jax.tree.map(converted, tree)

@@ -52,52 +52,69 @@ def time_stamps(dt: float, duration: float) -> np.ndarray:
 def draws(scenario: Scenario, key, normals, steps: int, dtype) -> dict[str, jax.Array]:
     """Standard normals (steps, columns) of each noise that the scenario has, and of no other.
 
-    Drawn for all steps at once: a draw in every step cost more than the physics.
+    Of a jitter of the delay they are numbers (steps,) in [0, 1). Drawn for all steps at once: a
+    draw in every step cost more than the physics.
     """
     noisy = [name for name in NOISE if getattr(scenario, name) is not None]
+    *noise_keys, jitter_key = jax.random.split(key, len(NOISE) + 1)
+    found = {}
+    if scenario.delay_jitter is not None:
+        found["delay_jitter"] = jax.random.uniform(jitter_key, (steps,), dtype)
     if normals is not None:
-        return {name: jnp.asarray(normals, dtype)[:, slice(*NOISE[name])] for name in noisy}
-    keys = dict(zip(NOISE, jax.random.split(key, len(NOISE)), strict=True))
+        return found | {n: jnp.asarray(normals, dtype)[:, slice(*NOISE[n])] for n in noisy}
+    keys = dict(zip(NOISE, noise_keys, strict=True))
     columns = {name: NOISE[name][1] - NOISE[name][0] for name in noisy}
-    return {name: jax.random.normal(keys[name], (steps, columns[name]), dtype) for name in noisy}
+    for name in noisy:
+        found[name] = jax.random.normal(keys[name], (steps, columns[name]), dtype)
+    return found
 
 
 @pytree
 class Sensors(Pytree):
     """What the sensors of a scenario remember."""
 
-    states: jax.Array | None  # (slots, 4) true ones, a ring buffer, where there is a delay
+    # (slots, 4) what they read, a ring buffer, where there is a delay.
+    states: jax.Array | None
     encoded: jax.Array | None  # (4,) the last angles and velocities of an encoder
 
 
 def sensors(scenario: Scenario, x0: jax.Array, slots: int) -> Sensors:
     """They before a run from ``x0`` (4,), with room for ``slots`` delayed states."""
-    states = None if scenario.delay is None else jnp.broadcast_to(x0, (slots, 4))
+    lags = scenario.delay is not None or scenario.delay_jitter is not None
+    states = jnp.broadcast_to(x0, (slots, 4)) if lags else None
     return Sensors(states, None if scenario.encoder is None else x0)
 
 
 def measure(scenario: Scenario, sensors: Sensors, k, x, z, dt):
     """Delayed and noisy measurement, as an encoder gives it; with the sensors after it.
 
-    The noise of angles is in front of the encoder, that of velocities behind its filter. ``dt`` is
-    the time from one measurement to the next, s.
+    What an encoder reads is delayed on its way; its noise of angles is in front of it, that of
+    velocities behind its filter. Without one the noise is behind the delay, as in the reference
+    simulator. ``dt`` is the time from one measurement to the next, s.
     """
-    states, seen = sensors.states, x
+    sigma, seen, encoded, states = scenario.measurement_noise, x, None, sensors.states
+    noise = None if sigma is None else sigma * z["measurement_noise"]
+    if (encoder := scenario.encoder) is not None:
+        before = sensors.encoded
+        assert before is not None
+        angles = x[:2] if noise is None else x[:2] + noise[:2]
+        angles = encoder.step * jnp.round(angles / encoder.step)
+        rate = jnp.where(k == 0, before[2:], (angles - before[:2]) / dt)
+        filtered = before[2:] + dt / (dt + encoder.filtered) * (rate - before[2:])
+        encoded = jnp.concatenate([angles, filtered])
+        seen = encoded if noise is None else encoded.at[2:].add(noise[2:])
     if states is not None:
         slots = states.shape[0]
-        states = jax.lax.dynamic_update_slice_in_dim(states, x[None], k % slots, 0)
-        lagged = jnp.maximum(k - scenario.delay, 0) % slots
+        states = jax.lax.dynamic_update_slice_in_dim(states, seen[None], k % slots, 0)
+        delay = np.zeros(4, "i4") if scenario.delay is None else scenario.delay
+        if scenario.delay_jitter is not None:
+            most = scenario.delay_jitter + 1
+            delay = delay + jnp.floor(z["delay_jitter"] * most).astype(jnp.int32)
+        lagged = jnp.maximum(k - delay, 0) % slots
         seen = jnp.take_along_axis(states, lagged[None], axis=0)[0]
-    sigma = scenario.measurement_noise
-    noisy = seen if sigma is None else seen + sigma * z["measurement_noise"]
-    if (encoder := scenario.encoder) is None:
-        return Sensors(states, None), noisy
-    assert sensors.encoded is not None
-    before, angles = sensors.encoded, encoder.step * jnp.round(noisy[:2] / encoder.step)
-    rate = jnp.where(k == 0, before[2:], (angles - before[:2]) / dt)
-    filtered = before[2:] + dt / (dt + encoder.filtered) * (rate - before[2:])
-    after = Sensors(states, jnp.concatenate([angles, filtered]))
-    return after, jnp.concatenate([angles, filtered + (noisy - seen)[2:]])
+    if encoder is None and noise is not None:
+        seen = seen + noise
+    return Sensors(states, encoded), seen
 
 
 def actuate(scenario: Scenario, command, applied_before, t_pulse, z):
@@ -175,9 +192,7 @@ def _check(scenario: Scenario | Plant, controller: Controller, delay_slots: int)
     if scenario.x0 is not None and (shape := jnp.shape(scenario.x0)) != (4,):
         text = f"x0 has shape {shape}; one rollout starts from (4,): vmap over batches of scenarios"
         raise JaxpendError(text)
-    known = None if isinstance(scenario.delay, jax.core.Tracer) else scenario.delay
-    longest = -1 if known is None else int(np.max(known))
-    if longest >= delay_slots:
+    if (longest := scenario.longest_delay) >= delay_slots:
         raise JaxpendError(
             f"a delay of {longest} steps does not fit in a buffer of {delay_slots} states; "
             f"pass delay_slots={longest + 1} or more"

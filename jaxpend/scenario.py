@@ -56,12 +56,20 @@ class Scenario(Pytree):
     x0: jax.Array | None = None  # (4,) initial state; None: hanging at rest
     measurement_noise: jax.Array | None = None  # (4,) standard deviation, rad and rad/s
     delay: jax.Array | None = None  # (4,) int, steps by which each measured component lags
+    delay_jitter: jax.Array | None = None  # () int, steps by which any measurement lags more
     process_noise: jax.Array | None = None  # (4,) standard deviation added after each step
     torque_noise: jax.Array | None = None  # (2,) N m, standard deviation
     responsiveness: jax.Array | None = None  # () fraction of the commanded change made per step
     pulses: Pulses | None = None
     encoder: Encoder | None = None  # what measures the angles; None: angles and velocities are
     resets: Resets | None = None  # by hand, in which the controller is not called
+
+    @property
+    def longest_delay(self) -> int:
+        """Steps by which a measurement of it, or of a batch, lags at most; 0 of traced values."""
+        parts = (self.delay, self.delay_jitter)
+        known = [p for p in parts if p is not None and not isinstance(p, jax.core.Tracer)]
+        return sum(int(np.max(part)) for part in known)
 
     @property
     def dtype(self):
@@ -127,6 +135,7 @@ def random_pulses(
 # What an imperfection of the benchmarks that is there has no effect with.
 NEUTRAL: dict[str, Any] = {
     "delay": np.zeros(4, "i4"),
+    "delay_jitter": np.zeros((), "i4"),
     "responsiveness": np.ones(()),
     "measurement_noise": np.zeros(4),
     "torque_noise": np.zeros(2),

@@ -29,6 +29,7 @@ from .criteria import (
 )
 from .errors import JaxpendError
 from .plant import Plant
+from .pytree import in_default
 from .resets import held
 from .rollout import Trajectory, rollout
 from .scenario import Scenario
@@ -87,9 +88,10 @@ def combined(
 
 @partial(jax.jit, static_argnames="task")
 def nominal(controller: Controller, task: Task) -> Criteria:
-    """``performance`` on the nominal plant, compiled once a kind of controller.
+    """``performance`` in what the score is of, compiled once a kind of controller.
 
-    Of a task in which chance plays it is that of ``task.repeats`` runs (trials,), always the same.
+    That is the nominal plant; of a task in which chance plays (``Task.chance``) it is
+    ``task.repeats`` trials (trials,), always the same.
     """
     key = jax.random.key(0)
     if task.repeats == 1:
@@ -114,7 +116,7 @@ def trial_run(
         passive = jnp.where(
             held(scenario.resets, np.arange(len(passive))).any(axis=-1), 0.0, passive
         )
-    return run, task.criteria(run), passive.max()
+    return run, task.criteria(run, scenario.plant), passive.max()
 
 
 @partial(jax.jit, static_argnames="task")
@@ -128,11 +130,6 @@ def _criteria(run: Trajectory, task: Task) -> Criteria:
     return task.criteria(run)
 
 
-def _in_default(leaf: Any) -> Any:
-    floating = jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
-    return jnp.asarray(leaf, jnp.result_type(float)) if floating else leaf
-
-
 def _ready(controller: Controller, task: Task) -> Controller:
     """The controller in jax's default float type.
 
@@ -140,7 +137,7 @@ def _ready(controller: Controller, task: Task) -> Controller:
     """
     check_form(controller)
     check_robot(controller, task.robot)
-    controller = jax.tree.map(_in_default, controller)
+    controller = in_default(controller)
     check_controller(controller)
     return controller
 
@@ -162,7 +159,7 @@ def official(controller: Controller, judged_on: Board | str) -> dict[str, Any]:
             joint where the plant would let it.
     """
     judged_on = board(judged_on)
-    if not judged_on.task.resets:
+    if not judged_on.task.chance:
         return official_run(controller, judged_on)[1]
     task, found = judged_on.task, []
     with jax.enable_x64(False):
@@ -259,7 +256,7 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
             f"is driven at joint {task.joint + 1}; the run is that of another robot"
         )
     with jax.enable_x64(True):
-        return _plain(_criteria(jax.tree.map(_in_default, run), task), task)
+        return _plain(_criteria(in_default(run), task), task)
 
 
 def _plain(c: Criteria, task: Task) -> dict[str, Any]:

@@ -62,7 +62,7 @@ def fitness(
     key_noise, key_scenarios = jax.random.split(key)
     noise = jnp.asarray(config.action_noise, jnp.float32) if config.action_noise else None
     noisy, policies = change_policies(controller, lambda p: p.replace(action_noise=noise))
-    draws = task.resets or (policies and config.action_noise)
+    draws = task.chance or (policies and config.action_noise)
     keys = jax.random.split(key_noise, config.rollouts if draws else 1)
     c = jax.vmap(lambda k: performance(noisy, task.trial(k), k, task))(keys)
     score, diverged = task.score(c).mean(), jnp.sum(c.diverged)

@@ -86,8 +86,8 @@ def _plan(
     size = (512 if scored else 4096) if chunk is None else chunk
     at_least_one(chunk=size)
     # The buffer is as long as the longest delay needs.
-    longest = 0 if scenarios.delay is None else int(np.max(scenarios.delay))
-    static = {"dt": dt, "duration": duration, "delay_slots": longest + 1}
+    slots = scenarios.longest_delay + 1
+    static = {"dt": dt, "duration": duration, "delay_slots": slots}
     static |= {"scoring": scoring, "height": height} if scored else {"scoring": None, "height": 0}
     keys = jax.random.split(key, len(scenarios.plant.mass))
     return _chunks(_lean(scenarios), keys, size), static

@@ -18,7 +18,8 @@ from jaxpend.fleet import CONDITIONS, judge_fleet, wilson
 from jaxpend.hardware import PRESETS, Spread, draw
 from jaxpend.plant import mass_matrix
 from jaxpend.rollout import rollout
-from jaxpend.scenario import Encoder, Scenario
+from jaxpend.scenario import Encoder, Scenario, check_values
+from jaxpend.score import nominal, official, official_run, trial_run
 
 TASK = HARDWARE["pendubot"].task
 KEY = jax.random.key(0)
@@ -49,8 +50,8 @@ def test_every_parameter_of_a_robot_is_off_within_its_range(name):
     assert (robots.plant.inertia > robots.plant.mass * robots.plant.com**2).all()
     upright = jnp.array([jnp.pi, 0.0, 0.0, 0.0])
     assert (np.linalg.eigvalsh(jax.vmap(mass_matrix, (0, None))(robots.plant, upright)) > 0).all()
-    delay = np.asarray(robots.delay[:, 0])
-    assert (delay.min(), delay.max()) == (0, 5)
+    for late, most in ((robots.delay[:, 0], 5), (robots.delay_jitter, 2)):
+        assert (late.min(), late.max()) == (0, most)
     assert (robots.responsiveness >= 0.8).all()
     assert not np.asarray(robots.torque_noise[:, 1]).any()
 
@@ -100,11 +101,62 @@ def test_an_encoder_gives_angles_in_steps_and_their_filtered_differences():
         np.testing.assert_allclose(loud[:, :2], seen[:, :2], atol=1e-5)
 
 
+@pytest.mark.parametrize("encoder", [None, Encoder(jnp.full(2, 1e-3), jnp.asarray(0.01))])
+def test_with_jitter_any_measurement_may_be_older_by_some_steps(encoder):
+    robot = Scenario(TASK.plant, jnp.array([1.0, 0.5, 0.3, 0.0]), encoder=encoder)
+    late = robot.replace(delay=jnp.full(4, 3), delay_jitter=jnp.asarray(4))
+    law = Feedback(lambda t, x: jnp.stack([1.5 * jnp.sin(9 * t), 0.0 * t]))
+    fresh, aged = (np.asarray(rollout(r, law, KEY, duration=1.0).x_measured) for r in (robot, late))
+    ages = []
+    for k in range(20, len(fresh)):
+        same = [age for age in range(10) if (fresh[k - age] == aged[k]).all()]
+        assert len(same) >= 1  # angle and velocity are of one time
+        ages += same if len(same) == 1 else []
+    np.testing.assert_array_equal(np.unique(ages), [3, 4, 5, 6, 7])
+    share = np.bincount(ages, minlength=8)[3:] / len(ages)
+    np.testing.assert_allclose(share, 0.2, atol=0.08)
+    none = rollout(robot.replace(delay_jitter=jnp.asarray(0)), law, KEY, duration=1.0)
+    np.testing.assert_array_equal(none.x_measured, fresh)
+
+
+def test_a_delay_with_its_jitter_has_to_fit_into_the_buffer():
+    robot = Scenario(TASK.plant, delay=jnp.full(4, 20), delay_jitter=jnp.asarray(12))
+    with refused("a delay of 32 steps does not fit in a buffer of 32 states"):
+        rollout(robot, Zero(), KEY)
+    with refused("jitter is 0.01; it must be in 0 to 0.005"):
+        Spread(delay=0.055, jitter=0.01)
+    with refused("delay_jitter is -1; it must not be negative"):
+        check_values(robot.replace(delay_jitter=np.asarray(-1)))
+
+
+def test_the_hardware_score_is_that_of_robots_and_not_of_the_nominal_plant():
+    board = HARDWARE["pendubot"]
+    one = board.drawn(3)
+    assert one.plant.mass[0] != TASK.plant.mass[0]
+    assert one.encoder is not None
+    assert not np.asarray(one.pulses.amplitude).any()
+    with jax.enable_x64(True):
+        again = board.drawn(3)
+        assert again.plant.mass.dtype == np.float64
+        assert again.encoder.filtered.dtype == np.float64
+        np.testing.assert_array_equal(again.plant.mass, one.plant.mass)
+        np.testing.assert_array_equal(again.delay, one.delay)
+    law = load_policy("hardware_pendubot")
+    found = official(law, dataclasses.replace(board, draws=3))
+    each = [float(TASK.score(trial_run(law, board.drawn(seed), TASK)[1])) for seed in range(3)]
+    assert found["draws"]["count"] == 3
+    assert np.ptp(each) > 1e-3
+    assert found["score"] == pytest.approx(np.mean(each), abs=1e-5)
+    # The noise of a run in float64 is another.
+    assert official_run(law, board, 1)[1]["score"] == pytest.approx(each[1], abs=0.03)
+    assert nominal(law, TASK).success.shape == (TASK.repeats,)
+
+
 def easy(**fields):
     """Robots that are all but nominal, judged for a second from upright."""
     spread = Spread(
-        inertial=1e-3, friction=0.0, encoder=0.0, velocity_noise=0.0, delay=0.0, torque_noise=0.0,
-        response=1.0, push=(5.0, 6.0),
+        inertial=1e-3, friction=0.0, encoder=0.0, velocity_noise=0.0, delay=0.0, jitter=0.0,
+        torque_noise=0.0, response=1.0, push=(5.0, 6.0),
     )  # fmt: skip
     return dataclasses.replace(TASK, spread=dataclasses.replace(spread, **fields))
 

@@ -176,9 +176,9 @@ def _check_draws(board, seed, draws, save, csv):
         raise JaxpendError(f"--csv is a run that is there already; leave out {given[0]}")
     if len(given) == 2:
         raise JaxpendError("--seed is one draw and --draws are the first of them; give one of them")
-    if seed is not None and not board.task.resets:
+    if seed is not None and not board.task.chance:
         raise JaxpendError(f"--seed names a draw, of which the {board.name} board has none")
-    if save is not None and csv is None and seed is None and board.task.resets:
+    if save is not None and csv is None and seed is None and board.task.chance:
         raise JaxpendError("--save writes one run; name its draw, such as --seed 0")
 
 
@@ -201,7 +201,7 @@ def _scored(subject, board, seed, save):
     if save is None and seed is None:
         return official(judged, board)
     run, result = official_run(judged, board, seed or 0)
-    result |= {"seed": seed} if board.task.resets else {}
+    result |= {"seed": seed} if board.task.chance else {}
     if save is not None:
         from ..interop.csv import save_csv
 

@@ -124,7 +124,12 @@ def _along(axes, name: str, found: dict[str, list[float]]) -> None:
 
 def write_hardware(result: dict[str, Any], folder: Path) -> Path:
     """Picture and JSON of a ``fleet.Fleet`` (``as_dict``), in a folder; the path of the picture."""
-    units = {"delay": "delay [s]", "push": "strongest push [N m]", "responsiveness": "response"}
+    units = {
+        "delay": "delay [s]",
+        "jitter": "jitter [s]",
+        "push": "strongest push [N m]",
+        "responsiveness": "response",
+    }
     draws = [
         partial(_along, name=units.get(name, f"{name} / nominal"), found=found)
         for name, found in result["by"].items()
