@@ -113,3 +113,11 @@ def test_criteria_and_grids_of_ones_own_are_drawn():
     whiskers = [sorted(line.get_xdata()) for line in bars.lines]
     assert whiskers == [[0.25, 0.5], [0.25, 0.5]]
     assert len(strips.images) == 2
+
+
+def test_where_a_hand_holds_the_arm_is_shaded(axes):
+    t, x = swing()
+    curves.draw_velocities(axes, t, x, end=0.5, held=np.array([[0.1, 0.2], [0.4, 0.6], [0.7, 0.8]]))
+    bands = [patch.get_extents().transformed(axes.transData.inverted()) for patch in axes.patches]
+    found = [(band.x0, band.x1) for band in bands]
+    np.testing.assert_allclose(found, [(0.1, 0.2), (0.4, 0.5)], atol=1e-9)

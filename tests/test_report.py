@@ -1,5 +1,6 @@
 """The page about a run: what it is made of, what it says, and how it behaves in a browser."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -14,14 +15,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxpend import cli, load_policy, save_policy
+from jaxpend import boards, cli, load_policy, resets, save_policy
 from jaxpend.boards import Board, v2
 from jaxpend.cli import commands
 from jaxpend.config import DemonstrationConfig, SACConfig, TrainRun
 from jaxpend.config_files import to_mapping
 from jaxpend.controllers.policy import network_in
 from jaxpend.pytree import pytree
-from jaxpend.report import page
+from jaxpend.report import judged, page
 from jaxpend.runs import reader as report
 from jaxpend.runs.folder import RunFolder, changed
 from jaxpend.score import official
@@ -510,3 +511,34 @@ def test_a_page_that_fails_is_noticed(made, tab, tmp_path):
     found = json.dumps(complaints(tab))
     assert "oops is not defined" in found
     assert "https://example.org/x" in found
+
+
+def test_the_page_on_real_robots_shows_which_of_them_stand(tmp_path, monkeypatch):
+    board = dataclasses.replace(boards.HARDWARE["pendubot"], draws=2)
+    monkeypatch.setitem(boards.HARDWARE, "pendubot", board)
+    monkeypatch.setattr(judged, "ROBOTS_JUDGED", 12)
+    commands.report(Path("hardware_pendubot"), out=tmp_path)
+    text = (tmp_path / "report.html").read_text()
+    assert "12 robots, tried twice" in text
+    kept = json.loads((tmp_path / "report" / "hardware_pendubot.json").read_text())
+    for name, found in kept["conditions"].items():
+        row = rf"<td>{name}</td><td>{100 * found['success']:.1f} %</td>"
+        assert re.search(row, text)
+    assert text.count('<th scope="row">delay [s]</th>') == 1
+    assert "the robot of seed 0" in text
+    assert "mean of 2 draws" in text
+    with Image.open(tmp_path / "report" / "hardware_pendubot.png") as picture:
+        assert picture.width > 500
+
+
+def test_the_page_on_the_global_board_shows_when_the_arm_is_held():
+    board = boards.V3["acrobot"]
+    shown = judged.held(board)
+    assert shown.shape == (15, 2)
+    steps = np.arange(board.task.steps)
+    by_hand = np.asarray(resets.held(board.drawn(0).resets, steps).any(axis=-1))
+    within = (steps[:, None] >= shown[:, 0] / 0.002 - 0.5) & (
+        steps[:, None] < shown[:, 1] / 0.002 - 0.5
+    )
+    np.testing.assert_array_equal(within.any(axis=1), by_hand)
+    assert judged.held(v2("acrobot")).shape == (0, 2)

@@ -33,6 +33,7 @@ def keyframes(judged: Judged) -> dict[str, Any]:
         "joints": np.round(judged.points[picked].reshape(-1, 4), 4).tolist(),
         "torque": np.round(torque[picked], 3).tolist(),
         "up": judged.up,
+        "held": np.round(judged.held, 3).tolist(),
     }
 
 

@@ -58,8 +58,11 @@ def _goals(x: np.ndarray) -> tuple[float, float]:
     return np.pi + turn1 * full, turn2 * full
 
 
-def _over_time(axes, title: str, ylabel: str, end: float, up: float | None) -> None:
-    """Time from 0 to ``end`` s, with a line where the swing-up is done."""
+def _over_time(axes, title: str, ylabel: str, end: float, up: float | None, held) -> None:
+    """Time from 0 to ``end`` s, a line where the swing-up is done, bands where a hand holds it."""
+    for first, last in held:
+        if first < end:
+            axes.axvspan(first, min(last, end), color=PALETTE["four"], alpha=0.35, linewidth=0)
     axes.set_title(title)
     axes.set_ylabel(ylabel)
     axes.set_xlabel("time [s]")
@@ -79,14 +82,14 @@ def _goal(axes, height: float, colour: str, text: str = "") -> None:
         )  # fmt: skip
 
 
-def draw_angles(axes, t, x, end: float, up: float | None = None) -> None:
+def draw_angles(axes, t, x, end: float, up: float | None = None, held=()) -> None:
     """Both angles over time (n,), s, of states (n, 4), with the goal as dashed lines."""
     shown, goals = t <= end, _goals(x)
     for joint, colour in enumerate(("one", "two")):
         axes.plot(t[shown], x[shown, joint], color=PALETTE[colour], label="θ" + "₁₂"[joint])
         _goal(axes, goals[joint], colour)
     _angle_axis(axes.yaxis, np.append(x[shown, :2], goals))
-    _over_time(axes, "Angles", "angle [rad]", end, up)
+    _over_time(axes, "Angles", "angle [rad]", end, up, held)
     if up is not None:
         axes.annotate(
             f"up at {up:.2f} s", (up, 0), xycoords=("data", "axes fraction"),
@@ -95,29 +98,31 @@ def draw_angles(axes, t, x, end: float, up: float | None = None) -> None:
     _legend(axes)
 
 
-def draw_velocities(axes, t, x, end: float, up: float | None = None) -> None:
+def draw_velocities(axes, t, x, end: float, up: float | None = None, held=()) -> None:
     """Both velocities over time; the goal is 0."""
     shown = t <= end
     for joint, colour in enumerate(("one", "two")):
         axes.plot(t[shown], x[shown, 2 + joint], color=PALETTE[colour], label="ω" + "₁₂"[joint])
     _goal(axes, 0, "muted")
-    _over_time(axes, "Velocities", "velocity [rad/s]", end, up)
+    _over_time(axes, "Velocities", "velocity [rad/s]", end, up, held)
     _legend(axes)
 
 
-def draw_torque(axes, t, u, joint: int, limit: float, end: float, up: float | None = None) -> None:
+def draw_torque(
+    axes, t, u, joint: int, limit: float, end: float, up: float | None = None, held=()
+) -> None:
     """Torque of the driven joint, N m, held between time stamps, with its limits dashed."""
-    held = t[: len(u)]
-    shown = held <= end
-    axes.step(held[shown], u[shown, joint], where="post", color=PALETTE["three"])
+    stamps = t[: len(u)]
+    shown = stamps <= end
+    axes.step(stamps[shown], u[shown, joint], where="post", color=PALETTE["three"])
     _goal(axes, -limit, "muted")
     _goal(axes, limit, "muted", f"limit ±{limit:g} N m")
     axes.set_ylim(-1.12 * limit, 1.12 * limit)
-    _over_time(axes, "Torque", f"torque τ{'₁₂'[joint]} [N m]", end, up)
+    _over_time(axes, "Torque", f"torque τ{'₁₂'[joint]} [N m]", end, up, held)
 
 
 def draw_height(
-    axes, t, y, reach: float, height: float, end: float, up: float | None = None
+    axes, t, y, reach: float, height: float, end: float, up: float | None = None, held=()
 ) -> None:
     """Height of the end effector over time, and the line that it has to cross.
 
@@ -127,12 +132,13 @@ def draw_height(
         reach: m, what it reaches when it is stretched.
         height: the line, as a fraction of ``reach``.
         end, up: s, of the time axis and of the swing-up; None without success.
+        held: (n, 2) s, from when to when somebody holds the arm.
     """
     shown = t <= end
     axes.plot(t[shown], y[shown], color=PALETTE["ink"])
     _goal(axes, height * reach, "three", f"{height:g} line")
     axes.set_ylim(-1.12 * reach, 1.12 * reach)
-    _over_time(axes, "Height of the end effector", "height [m]", end, up)
+    _over_time(axes, "Height of the end effector", "height [m]", end, up, held)
 
 
 def draw_phase(axes, x, joint: int) -> None:

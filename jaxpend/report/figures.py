@@ -26,6 +26,8 @@ from ..variations import VARIATIONS, Variation
 
 __all__ = [
     "PALETTE",
+    "UNITS",
+    "along",
     "map_figure",
     "panel",
     "robustness_figure",
@@ -56,6 +58,11 @@ STYLE: Any = {
     "text.color": PALETTE["ink"], "legend.frameon": False, "legend.fontsize": 10,
     "lines.linewidth": 1.8, "lines.solid_joinstyle": "round", "font.size": 11,
     "svg.fonttype": "none", "svg.hashsalt": "jaxpend", "figure.facecolor": PALETTE["paper"],
+}  # fmt: skip
+# Of quantities of a fleet; all others are shares of the nominal ones.
+UNITS = {
+    "delay": "delay [s]", "jitter": "jitter [s]", "push": "strongest push [N m]",
+    "responsiveness": "response",
 }  # fmt: skip
 styled = matplotlib.rc_context(STYLE)
 
@@ -122,20 +129,18 @@ def _along(axes, name: str, found: dict[str, list[float]]) -> None:
     axes.set(title=name, ylim=(-3, 103), ylabel="stand [%]")
 
 
-def write_hardware(result: dict[str, Any], folder: Path) -> Path:
-    """Picture and JSON of a ``fleet.Fleet`` (``as_dict``), in a folder; the path of the picture."""
-    units = {
-        "delay": "delay [s]",
-        "jitter": "jitter [s]",
-        "push": "strongest push [N m]",
-        "responsiveness": "response",
-    }
-    draws = [
-        partial(_along, name=units.get(name, f"{name} / nominal"), found=found)
+def along(result: dict[str, Any]) -> list[Callable[..., Any]]:
+    """Charts of a ``fleet.Fleet`` (``as_dict``): the share that stands over each quantity."""
+    return [
+        partial(_along, name=UNITS.get(name, f"{name} / nominal"), found=found)
         for name, found in result["by"].items()
     ]
+
+
+def write_hardware(result: dict[str, Any], folder: Path) -> Path:
+    """Picture and JSON of a ``fleet.Fleet`` (``as_dict``), in a folder; the path of the picture."""
     title = f"{result['robot']}: robots that stand, {result['preset']}"
-    figure = stack(draws, columns=4, size=(3.2, 2.4), title=title)
+    figure = stack(along(result), columns=4, size=(3.2, 2.4), title=title)
     figure.axes[0].legend()
     path = folder / f"{result['preset']}_{result['robot']}.png"
     folder.mkdir(parents=True, exist_ok=True)

@@ -11,13 +11,16 @@ import numpy as np
 from ..boards import HEADINGS, Board, Task
 from ..controllers.catalogue import find_controller
 from ..controllers.files import read_header
+from ..fleet import judge_fleet
 from ..plant import forward_kinematics
 from ..robots import ROBOTS
 from ..robustness import benchmark
 from ..runs.reader import RunRecord
 from ..score import official, official_run
 
-__all__ = ["Judged", "criteria_costs", "judge"]
+__all__ = ["Judged", "criteria_costs", "held", "judge"]
+
+ROBOTS_JUDGED = 200
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +37,8 @@ class Judged:
     points: Any  # (n, 2, 2) m, elbow and end effector, x and y
     header: dict  # of the policy file
     report: dict | None  # of the benchmark, as it is written to a file
+    fleet: dict | None  # of robots that differ, as ``jaxpend hardware`` writes it to a file
+    held: Any  # (n, 2) s, from when to when somebody held the arm
 
     @property
     def up(self) -> float | None:
@@ -76,13 +81,13 @@ def judge(
     Args:
         run: its policy is judged; the result is None where there is none yet.
         board: whose task it is judged on.
-        robustness: run the benchmark too.
+        robustness: run the benchmark too, or judge on a fleet of robots, as the board has it.
         controller: as in ``find_controller``, with the run's policy; alone, where that is the
             one that ships with the package.
     """
     if run.policy is None:
         return None
-    task, report = board.task, None
+    task, report, fleet = board.task, None, None
     policy = None if controller and run.policy in ROBOTS else run.policy
     found = partial(find_controller, policy, controller, task)
     with jax.enable_x64(True):
@@ -92,6 +97,9 @@ def judge(
         said = official(found(), board)
     if robustness and board.trials is not None:
         report = {"robot": run.robot} | benchmark(found(), board, jax.random.key(0)).as_dict()
+    if robustness and task.spread is not None:
+        many = judge_fleet(found(), task, jax.random.key(0), robots=ROBOTS_JUDGED)
+        fleet = {"robot": run.robot, "preset": board.name} | many.as_dict()
     x = np.asarray(trajectory.x)
     samples = np.isfinite(x).all(axis=1).cumprod().sum()  # the first one is the start
     return Judged(
@@ -105,7 +113,18 @@ def judge(
         points=np.asarray(points)[:samples],
         header=read_header(policy) if policy else {},
         report=report,
+        fleet=fleet,
+        held=held(board),
     )
+
+
+def held(board: Board) -> np.ndarray:
+    """When somebody holds the arm in the draw of seed 0, (n, 2) s."""
+    drawn = board.drawn(0)
+    if drawn is None or (resets := drawn.resets) is None:
+        return np.zeros((0, 2))
+    first, steps = np.asarray(resets.first), np.asarray(resets.steps)
+    return board.task.dt * np.stack([first, first + steps], axis=-1)
 
 
 def criteria_costs(judged: Judged) -> list[tuple[str, str, float]]:

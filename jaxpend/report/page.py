@@ -75,7 +75,7 @@ def _swing_charts(judged: Judged, end: float) -> list[Draw]:
         partial(draw_torque, u=judged.u, joint=task.joint, limit=task.torque_limit),
         partial(draw_height, y=y, reach=judged.reach, height=task.height),
     ]
-    return [partial(draw, t=t, end=end, up=judged.up) for draw in charts]
+    return [partial(draw, t=t, end=end, up=judged.up, held=judged.held) for draw in charts]
 
 
 def _svg(draw: Draw, name: str, title: str) -> str:
@@ -102,6 +102,10 @@ def _draw(judged: Judged, title: str, folder: Path) -> dict[str, list[str]]:
         figures.write_robustness(judged.report, folder)
         label = f"{title}: fraction of runs that end upright along every grid of the benchmark"
         drawn["strips"] = [figures.svg(figures.strips_figure(judged.report), "strips", label)]
+    if judged.fleet:
+        figures.write_hardware(judged.fleet, folder)
+        charts = figures.along(judged.fleet)
+        drawn["fleet"] = [_svg(draw, f"fleet{k}", title) for k, draw in enumerate(charts)]
     return drawn
 
 
@@ -235,6 +239,8 @@ def _best(
         "robust": robust,
         "criteria": criteria_costs(best),
         "six": {CRITERIA.get(name, name): share for name, share in six.items()},
+        "fleet": best.fleet,
+        "units": figures.UNITS,
         "ranking": sorted(ranking, key=lambda row: -row[1]),
         "film": film | {"runs": [{"name": r.name} | keyframes(found) for r, found in known]},
     }
