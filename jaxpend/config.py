@@ -19,6 +19,7 @@ from .fields import (
     Natural,
     NotNegative,
     Positive,
+    Preset,
     Robot,
     Seed,
     Share,
@@ -26,26 +27,11 @@ from .fields import (
 from .observation import Observation
 
 __all__ = [
-    "ACTIVATIONS",
-    "LINES",
-    "STRATEGIES",
-    "Activation",
-    "CheckpointConfig",
-    "DemonstrationConfig",
-    "EnvConfig",
-    "GradientConfig",
-    "GradientRun",
-    "GuardConfig",
-    "Objective",
-    "Reward",
-    "Run",
-    "SACConfig",
-    "SACRun",
-    "SNESConfig",
-    "SNESRun",
-    "Search",
+    "ACTIVATIONS", "LINES", "STRATEGIES", "Activation", "CheckpointConfig",
+    "DemonstrationConfig", "EnvConfig", "GradientConfig", "GradientRun", "GuardConfig",
+    "Objective", "Reward", "Run", "SACConfig", "SACRun", "SNESConfig", "SNESRun", "Search",
     "TrainRun",
-]
+]  # fmt: skip
 
 Activation = Literal["relu", "tanh", "silu"]
 ACTIVATIONS: tuple[str, ...] = get_args(Activation)
@@ -290,6 +276,8 @@ class Run(Checked):
 
     robot: Robot = "pendubot"
     board: BoardName = "v2"  # whose task it is; v3: of global policies; hardware: of real robots
+    # How the robots of the hardware board differ, see jaxpend.hardware.
+    preset: Preset = "identified"
     plant: str = ""  # file of the parameters of another plant; empty: that of the boards
     design: str = ""  # or an identified one by name, such as C.1/1.0
     seed: Seed = 0

@@ -207,7 +207,8 @@ class Env:
 
         def step(carry, z):
             x, now = carry
-            applied, k = actuate(scenario, torque, now.applied, now.k * dt, z), now.k + 1
+            applied = actuate(scenario, torque, now.applied, now.k * dt, z, now.measured)
+            k = now.k + 1
             x = rk4_step(scenario.plant, x, applied, dt)
             after, measured = measure(scenario, now.sensors, k, x, z, dt)
             return (x, World(scenario, after, measured, applied, k, key)), None

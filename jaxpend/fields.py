@@ -84,7 +84,7 @@ Share = Annotated[float, Bounds(least=0, most=1)]
 # Keys of jax are made of 32 bits; the largest seed is for scenarios that no run trains on.
 Seed = Annotated[int, Bounds(least=0, below=LARGEST)]
 Robot = Literal["acrobot", "pendubot"]
-Preset = Literal["identified", "wide", "authors"]  # of ``hardware.PRESETS``
+Preset = Literal["identified", "wide", "compensated", "authors"]  # of ``hardware.PRESETS``
 BoardName = Literal["v2", "v3", "hardware"]
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from .errors import JaxpendError
 from .plant import Plant
-from .scenario import DT, Encoder, Scenario, random_pulses
+from .scenario import DT, Compensation, Encoder, Scenario, random_pulses
 
 __all__ = ["PRESETS", "Spread", "draw"]
 
@@ -38,6 +38,8 @@ class Spread:
     response: float = 0.8  # least share of a change of the torque that a step makes; 1: all
     push: tuple[float, float] = (0.5, 3.0)  # N m, of a disturbance pulse, where there are pushes
     pushes: int = 2  # on each joint in a run
+    # N m, up to which a motor in the passive joint takes off the friction that is believed.
+    compensation: float = 0.0
 
     def __post_init__(self) -> None:
         most_of = {"inertial": 1.0, "friction": 1.0, "response": 1.0, "delay": LONGEST}
@@ -47,17 +49,20 @@ class Spread:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be in 0 to {most:g}")
         if not self.inertial < 1:
             raise JaxpendError("inertial is 1; a robot without mass is none")
-        for name in ("encoder", "filtered", "angle_noise", "velocity_noise", "torque_noise"):
+        for name in ("encoder", "filtered", "angle_noise", "velocity_noise", "torque_noise",
+                     "compensation"):  # fmt: skip
             if not 0 <= getattr(self, name) < math.inf:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must not be negative")
 
 
 # "identified": as well as a robot is known after identification. "wide": as one that is not.
+# "compensated": as identified, with the friction compensation that the boards allow.
 # "authors": up to the worst that the noisy training of Evolutionary SAC drew (arXiv 2409.08938):
 # noise of 0.02, a delay of 0.06 s, a response of 0.85, pulses of 0.4 to 0.6 N m.
 PRESETS = {
     "identified": Spread(),
     "wide": Spread(inertial=0.25, friction=1.0),
+    "compensated": Spread(compensation=0.5),
     "authors": Spread(
         inertial=0.0, friction=0.0, encoder=0.0, filtered=0.0, angle_noise=0.02,
         velocity_noise=0.02, delay=0.06, jitter=0.0, torque_noise=0.0, response=0.85,
@@ -96,7 +101,10 @@ def draw(spread: Spread, plant: Plant, key: jax.Array, *, pushed: Any, duration:
     pulses = random_pulses(
         keys["pulses"], duration=duration - 2.0, per_joint=spread.pushes, amplitude=spread.push
     )
-    encoder = None
+    encoder = compensation = None
+    if spread.compensation:
+        limit = jnp.where(plant.torque_limit > 0, 0.0, spread.compensation)
+        compensation = Compensation(plant, limit)
     if spread.encoder:
         encoder = Encoder(jnp.full(2, spread.encoder), jnp.asarray(spread.filtered))
     return Scenario(
@@ -108,4 +116,5 @@ def draw(spread: Spread, plant: Plant, key: jax.Array, *, pushed: Any, duration:
         responsiveness=spread.response + (1 - spread.response) * rest[5],
         pulses=pulses.replace(amplitude=jnp.where(pushed, pulses.amplitude, 0.0)),
         encoder=encoder,
+        compensation=compensation,
     )

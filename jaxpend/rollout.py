@@ -117,8 +117,11 @@ def measure(scenario: Scenario, sensors: Sensors, k, x, z, dt):
     return Sensors(states, encoded), seen
 
 
-def actuate(scenario: Scenario, command, applied_before, t_pulse, z):
-    """Torque that reaches the joints: response, noise, limit, disturbance, in this order."""
+def actuate(scenario: Scenario, command, applied_before, t_pulse, z, measured):
+    """Torque that reaches the joints: response, noise, limit, disturbance, in this order.
+
+    A compensation of friction, by what is ``measured`` (4,), comes behind the limit.
+    """
     limit, torques = scenario.plant.torque_limit, []
     for joint in range(2):  # apart from each other, as in ``plant.joint_torque``
         u = command[joint]
@@ -128,6 +131,8 @@ def actuate(scenario: Scenario, command, applied_before, t_pulse, z):
             u = u + scenario.torque_noise[joint] * z["torque_noise"][joint]
         torques.append(jnp.clip(u, -limit[joint], limit[joint]))
     u = jnp.stack(torques)
+    if scenario.compensation is not None:
+        u = u + scenario.compensation.torque(measured)
     return u if scenario.pulses is None else u + scenario.pulses.torque(t_pulse)
 
 
@@ -166,7 +171,7 @@ def _closed_loop(
         if scenario.resets is not None:  # to the controller it is as if time had jumped
             command = jnp.where(holds, torque, command)
             after = jax.tree.map(lambda old, new: jnp.where(holds, old, new), memory, after)
-        u = actuate(scenario, command, u, now["t_pulse"], now["z"])
+        u = actuate(scenario, command, u, now["t_pulse"], now["z"], measured)
         x_next = integrator(plant, x, u, dt)
         if scenario.process_noise is not None:
             x_next = x_next + scenario.process_noise * now["z"]["process_noise"]

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from .errors import JaxpendError, choose
-from .plant import Plant
+from .plant import Plant, friction_vector
 from .pytree import Pytree, pytree
 from .resets import Resets
 
 __all__ = [
-    "DT", "DURATION", "NEUTRAL", "Encoder", "Pulses", "Scenario", "check_values", "delay_steps",
-    "random_pulses", "with_neutral",
+    "DT", "DURATION", "NEUTRAL", "Compensation", "Encoder", "Pulses", "Scenario", "check_values",
+    "delay_steps", "random_pulses", "with_neutral",
 ]  # fmt: skip
 
 # Of the boards, and of everything here that does not say otherwise, s.
@@ -49,6 +49,21 @@ class Encoder(Pytree):
 
 
 @pytree
+class Compensation(Pytree):
+    """Friction that motors take off by themselves, as the measured velocities say.
+
+    The controller does not know of it, and its torque limit is apart from this one.
+    """
+
+    plant: Plant  # that is believed: its friction is taken off
+    limit: jax.Array  # (2,) N m; 0: a joint without
+
+    def torque(self, x: jax.Array) -> jax.Array:
+        """What is added to the torques at a measured state (4,): (2,) N m."""
+        return jnp.clip(friction_vector(self.plant, x), -self.limit, self.limit)
+
+
+@pytree
 class Scenario(Pytree):
     """What a controller is put into. Only ``plant`` is required; the rest defaults to nominal."""
 
@@ -61,6 +76,7 @@ class Scenario(Pytree):
     torque_noise: jax.Array | None = None  # (2,) N m, standard deviation
     responsiveness: jax.Array | None = None  # () fraction of the commanded change made per step
     pulses: Pulses | None = None
+    compensation: Compensation | None = None
     encoder: Encoder | None = None  # what measures the angles; None: angles and velocities are
     resets: Resets | None = None  # by hand, in which the controller is not called
 

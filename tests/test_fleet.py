@@ -10,7 +10,7 @@ import pytest
 from conftest import refused
 
 from jaxpend import designs
-from jaxpend.boards import HARDWARE, v2
+from jaxpend.boards import HARDWARE, task_of, v2
 from jaxpend.cli.app import main
 from jaxpend.controller import Feedback, Zero
 from jaxpend.controllers.files import load_policy
@@ -117,6 +117,38 @@ def test_with_jitter_any_measurement_may_be_older_by_some_steps(encoder):
     np.testing.assert_allclose(share, 0.2, atol=0.08)
     none = rollout(robot.replace(delay_jitter=jnp.asarray(0)), law, KEY, duration=1.0)
     np.testing.assert_array_equal(none.x_measured, fresh)
+
+
+def test_a_motor_in_the_passive_joint_takes_off_the_friction_that_is_believed():
+    passive = 1  # of the pendubot
+    robot = jax.tree.map(lambda leaf: leaf[0], drawn(PRESETS["compensated"], 1, False))
+    assert robot.compensation.limit.tolist() == [0.0, 0.5]
+    x = jnp.array([0.0, 0.0, 3.0, -2.0])
+    believed = TASK.plant.damping[passive] * -2.0
+    believed += TASK.plant.coulomb_friction[passive] * np.arctan(-200.0)
+    np.testing.assert_allclose(robot.compensation.torque(x), [0.0, believed], rtol=1e-5)
+    fast = robot.compensation.torque(x.at[3].set(1e4))
+    np.testing.assert_allclose(fast, [0.0, 0.5])
+    # It reaches the joint, though the controller's torque limit there is 0; on the plant that is
+    # believed no friction is left.
+    plain = Scenario(TASK.plant.replace(actuation=jnp.ones(2)), jnp.array([0.0, 0.5, 0.0, 0.0]))
+    helped = plain.replace(compensation=robot.compensation.replace(plant=plain.plant))
+    driven = np.array([1.0, 0.0], "f4")
+    free = {name: driven * getattr(plain.plant, name) for name in ("damping", "coulomb_friction")}
+    free = plain.replace(plant=plain.plant.replace(**free))
+    x, helped, free = (rollout(s, Zero(), KEY, duration=0.3).x for s in (plain, helped, free))
+    np.testing.assert_allclose(helped, free, atol=0.02)  # it lags by a step
+    assert np.abs(x - free).max() > 0.2
+
+
+def test_robots_of_another_preset_are_trained_and_judged():
+    task = task_of("pendubot", board="hardware", preset="wide")
+    assert task.spread == PRESETS["wide"]
+    assert task_of("pendubot", board="hardware") == TASK
+    with refused("preset is wide; the v2 board has no robots that differ"):
+        task_of("pendubot", preset="wide")
+    with refused("preset is 'odd'"):
+        task_of("pendubot", board="hardware", preset="odd")
 
 
 def test_a_delay_with_its_jitter_has_to_fit_into_the_buffer():

@@ -19,6 +19,7 @@ stepping
 controller
 rollout
 criteria
+task
 boards
 score sweep identification
 robustness fleet

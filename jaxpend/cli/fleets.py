@@ -29,7 +29,8 @@ def hardware(
         robot: which joint is driven: the second of the acrobot, the first of the pendubot.
         policy: a policy or controller file; by default the hardware policy that ships.
         controller: judge this instead, as in jaxpend score.
-        preset: how robots differ: identified, wide, or as the authors trained.
+        preset: how robots differ: identified, wide, compensated (passive friction, by a motor
+            there), or as the authors trained.
         robots: how many are drawn; each is tried without and with pushes.
         seed: of the draws.
         plant: YAML file of the nominal parameters, by default those of design C.1 model 1.0.

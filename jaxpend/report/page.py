@@ -15,6 +15,7 @@ from .. import __version__, boards
 from ..boards import CRITERIA, Board
 from ..config_files import flat
 from ..files import write_atomically
+from ..hardware import PRESETS
 from ..runs.reader import RunRecord, StageRecord, remarks
 from ..runs.statistics import interquartile_mean, interval
 from . import figures
@@ -133,6 +134,10 @@ def _board(run: RunRecord) -> Board:
     """The board of a run; of a run on a plant of its own, on that, and unpublished."""
     plant, on = run.made_by.get("plant"), run.config.get("board") or run.made_by.get("board")
     official = boards.named_board(run.robot, on if on in boards.BOARDS else "v2")
+    spread = PRESETS.get(str(run.config.get("preset")))
+    if spread and official.task.spread:
+        task = dataclasses.replace(official.task, spread=spread)
+        official = dataclasses.replace(official, task=task)
     if not plant or plant == dict(official.task.parameters):
         return official
     name = run.config.get("plant") or run.config.get("design") or "a plant of its own"

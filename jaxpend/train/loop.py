@@ -112,7 +112,8 @@ def train(
         Stopped: a signal asked for it, and everything is on disk.
     """
     devices.use(config.devices)
-    task, start = task_of(config.robot, config.plant, config.design, config.board), None
+    names = (config.robot, config.plant, config.design, config.board, config.preset)
+    task, start = task_of(*names), None
     if isinstance(config, GradientRun | SNESRun):
         # Before the folder is made: a wrong file leaves nothing behind.
         start = find_controller(config.policy, config.controller, task)
