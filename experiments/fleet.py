@@ -60,10 +60,11 @@ def holdable(task):
     held = np.zeros(HELD, bool)
     for price in PRICES:
         for friction in (True, False):
-            for known in ([task.plant] * HELD, plants):
+            for known in ([task.plant], plants):
                 if not friction:
                     known = [p.replace(coulomb_friction=None) for p in known]
-                each = map(partial(lqr, robot=task.robot, r=price), known)
+                each = list(map(partial(lqr, robot=task.robot, r=price), known))
+                each *= HELD // len(each)
                 laws = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
                 held |= np.asarray(stands(robots, laws, keys))
     return held.mean()

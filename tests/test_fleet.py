@@ -147,7 +147,7 @@ def test_robots_of_another_preset_are_trained_and_judged():
     assert task_of("pendubot", board="hardware") == TASK
     with refused("preset is wide; the v2 board has no robots that differ"):
         task_of("pendubot", preset="wide")
-    with refused("preset is 'odd'"):
+    with refused("unknown preset 'odd'"):
         task_of("pendubot", board="hardware", preset="odd")
 
 

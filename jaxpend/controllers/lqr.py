@@ -54,6 +54,9 @@ def in_float64(tree: Any) -> Any:
     return jax.tree.map(lambda v: jnp.asarray(np.asarray(v), jnp.float64), tree)
 
 
+_linearize = jax.jit(linearize)
+
+
 def _upright(plant: Plant, joint: int, dt: float | None = None) -> tuple[np.ndarray, np.ndarray]:
     """A (4, 4) and B (4, 1) of the linearisation at upright, float64.
 
@@ -62,7 +65,7 @@ def _upright(plant: Plant, joint: int, dt: float | None = None) -> tuple[np.ndar
     from scipy.linalg import expm
 
     with jax.enable_x64(True):
-        linear = linearize(in_float64(plant), jnp.array(UPRIGHT), jnp.zeros(2))
+        linear = _linearize(in_float64(plant), jnp.array(UPRIGHT), jnp.zeros(2))
         a, b = (np.asarray(matrix) for matrix in linear)
     b = b[:, joint : joint + 1]
     if dt is None:
