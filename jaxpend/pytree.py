@@ -44,10 +44,12 @@ def pytree(cls: type[T]) -> type[T]:
 
 
 def in_default(tree: T) -> T:
-    """A pytree with its floating-point arrays in jax's default float type."""
+    """A pytree with its floating-point and whole numbers in jax's default types of them."""
 
     def converted(leaf: Any) -> Any:
-        floating = jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
-        return jnp.asarray(leaf, jnp.result_type(float)) if floating else leaf
+        for kind, default in ((jnp.floating, float), (jnp.signedinteger, int)):
+            if jnp.issubdtype(jnp.result_type(leaf), kind):
+                return jnp.asarray(leaf, jnp.result_type(default))
+        return leaf
 
     return jax.tree.map(converted, tree)

@@ -16,6 +16,7 @@ from jaxpend.config import EnvConfig, GradientConfig, TrainRun
 from jaxpend.controller import Feedback, Zero
 from jaxpend.controllers.callback import realaigym
 from jaxpend.controllers.files import load_policy
+from jaxpend.controllers.mpc import free_mpc
 from jaxpend.controllers.policy import network_in
 from jaxpend.env import Env, _thrown_states
 from jaxpend.gradient import Gradient
@@ -148,6 +149,15 @@ def test_the_score_is_the_mean_of_the_draws():
     assert nominal(policy, board.task).uptime.shape == (board.task.repeats,)
     c, stands = imperfect(policy, board.task, jax.random.key(1), 3)
     assert c.uptime.shape == stands.shape == (3,)
+
+
+def test_what_was_made_in_float64_is_judged_in_float32():
+    """Whole numbers too: the plan of an MPC counts its iterations."""
+    board = short("pendubot", draws=1)
+    with jax.enable_x64(True):
+        mpc = free_mpc(board.task.plant, "pendubot", horizon=5, starts=1, first_iterations=1)
+        assert mpc.first.rejected.dtype == np.int64
+    assert 0 <= official(mpc, board)["score"] < 1
 
 
 def test_a_law_that_drives_the_passive_joint_is_refused():
