@@ -23,7 +23,7 @@ from jaxpend.boards import V3
 from jaxpend.plant import rk4_step, tip_height
 from jaxpend.score import official
 
-DRAWS = 12  # runs of a minute, with 15 resets each
+DRAWS = 5  # runs of a minute, with 15 resets each
 HORIZON = 2.5  # s
 KNOT = 10  # steps of 2 ms in which an added torque is the same
 STARTS, STEPS = 6, 250

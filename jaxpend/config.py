@@ -288,6 +288,11 @@ class Run(Checked):
     # How many GPUs, or cores of a processor, share rollouts; 0: all. The cores share the steps of
     # SAC too where the number is given.
     devices: Natural = 0
+    # Processes that compute the run together, of which this is number ``host``, and HOST:PORT of
+    # number 0; hosts 0: those that the cluster's environment names.
+    hosts: Natural = 1
+    host: Natural = 0
+    coordinator: str = ""
     # Name of the run folder; empty: ROBOT-seedSEED, of one stage alone ROBOT-STAGE-seedSEED, of
     # another board than v2 ROBOT-BOARD-...
     run: str = ""

@@ -11,8 +11,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from . import hosts
 from .errors import JaxpendError
 
 __all__ = ["asked", "compute", "everywhere", "split", "spread", "together", "use"]
@@ -22,12 +24,12 @@ _asked = 0
 
 
 def use(count: int) -> None:
-    """How many devices to use from now on, the first of ``jax.devices()``; 0: all of them.
+    """How many devices to use from now on, the first of those of each host; 0: all of them.
 
     Raises ``JaxpendError`` where there are not so many.
     """
     global _asked
-    there = len(jax.devices())
+    there = jax.local_device_count()
     if count > there:
         text = f"devices is {count}; jax has {there} here"
         if jax.default_backend() == "cpu":
@@ -44,7 +46,8 @@ def asked() -> bool:
 
 def _mesh() -> Mesh | None:
     """The devices in use, if they are several."""
-    devices = jax.devices()[: _asked or None]
+    each = [jax.local_devices(process_index=host) for host in range(jax.process_count())]
+    devices = [device for own in each for device in own[: _asked or None]]
     if len(devices) == 1:
         return None
     return jax.make_mesh((len(devices),), (AXIS,), (AxisType.Auto,), devices=devices)
@@ -83,16 +86,40 @@ def compute(function: Callable[..., Any], *args: Any, **static: Any) -> Any:
     """What a function of arrays gives on all devices in use; it lies on the first one then.
 
     Every computation around it stays on one device. ``static`` are arguments that hold no arrays.
+
+    Raises:
+        JaxpendError: another host is gone.
     """
-    with together(*args):
-        found = function(*everywhere(args), **static)
-    return found if _mesh() is None else jax.device_put(found, jax.devices()[0])
+    if _mesh() is None:
+        return function(*args, **static)
+    here = jax.local_devices()[0]
+    if jax.process_count() == 1:
+        with together(*args):
+            found = function(*everywhere(args), **static)
+        return jax.device_put(found, here)
+    with hosts.guarded():
+        with together(*args):
+            found = function(*everywhere(args), **static)
+        own = jax.tree.map(lambda leaf: leaf.addressable_data(0), found)
+        return jax.block_until_ready(jax.device_put(own, here))
 
 
 def everywhere(tree: Any) -> Any:
     """Arrays, of which each device has a copy where ``together`` is in force."""
     mesh = jax.sharding.get_mesh()
-    return tree if mesh.empty else jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
+    if mesh.empty:
+        return tree
+    copied = NamedSharding(mesh, PartitionSpec())
+    if jax.process_count() == 1:
+        return jax.device_put(tree, copied)
+
+    def put(leaf: Any) -> jax.Array:
+        """Of an array that all hosts have alike; nothing is sent."""
+        leaf = leaf if isinstance(leaf, jax.Array) else np.asarray(leaf)
+        own = [jax.device_put(leaf, device) for device in mesh.local_devices]
+        return jax.make_array_from_single_device_arrays(own[0].shape, copied, own)
+
+    return jax.tree.map(put, tree)
 
 
 def split(function: Callable[..., Any]) -> Callable[..., Any]:

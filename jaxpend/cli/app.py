@@ -130,6 +130,8 @@ def one_sentence(prog: str) -> Iterator[None]:
         with contextlib.suppress(OSError):
             print(f"{prog}: {text}", file=sys.stderr)
     drop_unwritable()
+    if (hosts := sys.modules.get("jaxpend.hosts")) is not None:
+        hosts.leave(code)
     sys.exit(code)
 
 

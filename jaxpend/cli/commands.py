@@ -49,12 +49,15 @@ def snes(config: SNESRun, command: str) -> None:
 def execute(config: Run, command: str) -> None:
     """``train.train``, then the score table, and where the results are."""
     board = board_of(config.robot, config.plant, config.design, config.board)
+    from ..hosts import first
     from ..runs.reader import read_run
     from ..terminal import console
     from ..train import train
     from .tables import score_table, seeds_table
 
     result = train(config, command)
+    if not first():  # the first host says it
+        return
     if config.seeds > 1:
         seeds_table(result)
     else:

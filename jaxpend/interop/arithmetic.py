@@ -53,7 +53,7 @@ class Arithmetic:
 
 def work(code: str, helpers: Mapping[str, str]) -> int:
     """Operators in a piece of C and in the helpers that it calls, at most."""
-    found = len(re.findall(r" (?:[-+*/<>?]|<=|>=|==|!=|&&|\|\|) ", code))
+    found = len(re.findall(r" (?:[-+*/]=?|[<>?]|<=|>=|==|!=|&&|\|\|) ", code))
     called = re.findall(r"\{p\}(_\w+)\(", code)
     bodies = {name: text.partition("{\n")[2] for name, text in helpers.items()}
     return found + sum(work(bodies[name], helpers) for name in called if name in bodies)
@@ -97,8 +97,8 @@ _HELPERS = {
         static inline REAL {p}_rem(REAL a, REAL b)
         {
             const REAL size = a < 0 ? -a : a, d = b < 0 ? -b : b, turns = size / d;
-            if (!(turns < 4194304.0f)) return a - a;
             if (turns < 1.0f) return a;
+            if (!(turns < 4194304.0f)) return NAN;
             const REAL n = (REAL)(int)turns, c = SPLITf * d, high = c - (c - d);
             REAL rest = (size - n * high) - n * (d - high);
             if (rest < 0) rest += d;

@@ -1,9 +1,11 @@
 """A controller as one C header: no allocation, no loops of unknown length.
 
 It is C99 and needs no more of the C library than sinf, cosf, tanhf and expf, as far as the
-controller uses them (and sqrtf, logf or atanf for a controller of your own that has them, or an
-observer of a plant with Coulomb friction). It relies on numbers that are not finite and on exact
-differences, and does not compile with -ffast-math.
+controller uses them, and none of these in "float32", which has fmaf where that is an instruction
+(sqrtf, logf or atanf are for a controller of your own that has them, or an observer of a plant
+with Coulomb friction). It relies on numbers that are not finite and on exact differences, and does
+not compile with -ffast-math; a compiler that fuses products and sums without saying so, by
+FP_FAST_FMAF, has to be told not to.
 
 How it computes is one of ``arithmetic.ARITHMETIC``. On the same measurements a torque differs from
 that of jax in float64, whatever the controller,
@@ -47,6 +49,8 @@ WHOLE = {
 ROWS = {"total": "add", "largest": "max", "smallest": "min"}
 MOVES = ("item", "take", "pack", "concat")
 LOOP = "for (int i = 0; i < {}; ++i) "
+HEADS = re.compile(r"\bfor \(.*?\+\+\w\) |\[[^\]]*\]")  # of loops, and indices
+P = {"p": "{p}"}  # the prefix of names, which comes last
 FILE = """\
 /* The controller {name} of jaxpend, one step in C99; jaxpend.interop.c wrote it.
  *
@@ -66,8 +70,8 @@ FILE = """\
 
 #include <math.h>
 
-#ifdef __FAST_MATH__
-#error "compile this file without -ffast-math: it relies on exact differences"
+#if defined __FAST_MATH__ || defined __ASSOCIATIVE_MATH__ || (__FINITE_MATH_ONLY__ + 0)
+#error "compile this file without -ffast-math and its parts: it relies on exact differences"
 #endif
 {typedef}
 typedef struct {{
@@ -89,12 +93,15 @@ static inline void {p}_step({p}_state *s, {given} t, const {given} x[4], {given}
 PAIRS = """
  * A number is the sum of two floats, h and l, of which l is the rounding error of h."""
 TYPEDEF = """
+#ifdef __clang__
+#pragma STDC FP_CONTRACT OFF
+#endif
 #include <float.h>
 #if FLT_EVAL_METHOD
 #error "compile this file for arithmetic in float, for x86 with -mfpmath=sse"
 #endif
 
-typedef struct {{ float h, l; }} {p}_real;
+typedef struct { float h, l; } {p}_real;
 """
 
 
@@ -120,15 +127,14 @@ def source(
         raise JaxpendError(f"the prefix {prefix!r} is no name in C; use letters, digits and _")
     arithmetic = ARITHMETIC[choose("precision", precision, ARITHMETIC)]
     program = trace(controller, arithmetic.traced)
-    return _Printer(program, arithmetic, prefix).text()
+    return _Printer(program, arithmetic).text(prefix)
 
 
 class _Printer:
-    """Prints one program with one arithmetic."""
+    """Prints one program with one arithmetic; {p} stands for the prefix until the end."""
 
-    def __init__(self, program: Program, arithmetic: Arithmetic, prefix: str):
-        self.program, self.arithmetic, self.prefix = program, arithmetic, prefix
-        self.real = arithmetic.real.format(p=prefix)
+    def __init__(self, program: Program, arithmetic: Arithmetic):
+        self.program, self.arithmetic, self.real = program, arithmetic, arithmetic.real
         self.types = {"float": self.real, "int": "int", "bool": "int"}
         self.width = {"float": arithmetic.width, "int": 4, "bool": 4}
         self.names = named(program.nodes, self.literal, "s->s{}", "{}[{}]")
@@ -142,34 +148,33 @@ class _Printer:
                 self.names[node] = self.wide(self.names[node])
 
     def wide(self, name: str) -> str:
-        return self.arithmetic.wide.format(name, p=self.prefix)
+        return self.arithmetic.wide.format(name, p="{p}")
 
-    def text(self) -> str:
-        program, p = self.program, self.prefix
+    def text(self, prefix: str) -> str:
+        program, paired = self.program, self.arithmetic.paired
         step = [self.table(node) for node in program.tables]
-        step += [line for node in program.steps for line in self.lines(node)]
+        step += [line for node in program.steps for _, line in self.lines(node)]
         step += ["(void)t, (void)x, (void)s;"]
         torque = (self.arithmetic.narrow.format(self.names[node]) for node in program.torque)
         step += [f"torque[{i}] = {value};" for i, value in enumerate(torque)]
         step += self.kept()
-        text, init = "\n".join(step), self.initial()
-        work, calls = self.counted()
+        text, init = "\n".join(step), "\n".join(self.initial())
+        total, calls = self.counted()
         fields = [
             f"    {self.types[leaf.kind]} s{number}[{leaf.initial.size}]; /* {leaf.path} */"
             for number, leaf in enumerate(program.state)
         ]
         state = sum(self.width[leaf.kind] * leaf.initial.size for leaf in program.state)
         vectors = [node for node in program.steps if node.size]
-        paired = self.arithmetic.paired
         return FILE.format(
-            name=program.name, p=p, guard=f"{p.upper()}_H", given=self.arithmetic.given,
-            pairs=PAIRS if paired else "", typedef=TYPEDEF.format(p=p) if paired else "",
-            work=work, calls=calls, state=state or 4,
+            name=program.name, p="{p}", guard=f"{prefix.upper()}_H", given=self.arithmetic.given,
+            pairs=PAIRS if paired else "", typedef=TYPEDEF if paired else "",
+            work=total, calls=calls, state=state or 4,
             constants=sum(map(self.bytes, program.tables)),
             stack=sum(map(self.bytes, vectors)), struct="\n".join(fields) or "    int none;",
-            helpers="".join(f"\n{helper}\n" for helper in self.helpers(text + "\n".join(init))),
-            init="\n".join(init), step=textwrap.indent(text, "    "),
-        )  # fmt: skip
+            helpers="".join(f"\n{helper}\n" for helper in self.helpers(text + init)),
+            init=init, step=textwrap.indent(text, "    "),
+        ).replace("{p}", prefix)  # fmt: skip
 
     def bytes(self, node: Node) -> int:
         return (4 if node in self.exact else self.width[node.kind]) * (node.size or 0)
@@ -178,18 +183,16 @@ class _Printer:
         """Those that a text needs, and those that they need, in order."""
         found: list[str] = []
         for name, code in reversed(list(self.arithmetic.helpers.items())):
-            code = textwrap.dedent(code).strip().replace("{p}", self.prefix)
-            if f"{self.prefix}{name}(" in text:
+            code = textwrap.dedent(code).strip()
+            if f"{{p}}{name}(" in text:
                 text += code
                 found.insert(0, code)
         return found
 
     def literal(self, value: np.ndarray) -> str:
         """A number as C writes it in an expression."""
-        if value.dtype.kind == "f":
-            text = self.arithmetic.literal(value).replace("{p}", self.prefix)
-        else:
-            text = str(int(value.item()))
+        number = value.dtype.kind == "f"
+        text = self.arithmetic.literal(value) if number else str(int(value.item()))
         return f"({text})" if text.startswith("-") else text
 
     def table(self, node: Node) -> str:
@@ -248,41 +251,40 @@ class _Printer:
         text = f"{self.names[node]}[{index}]"
         return self.wide(text) if node in self.exact else text
 
-    def lines(self, node: Node) -> list[str]:
-        """The statements that compute a node."""
-        name, kind = self.names[node], self.types[node.kind]
-        if node.size is None:
+    def lines(self, node: Node) -> list[tuple[int, str]]:
+        """The statements that compute a node, each with how often it is carried out."""
+        name, kind, size = self.names[node], self.types[node.kind], node.size
+        if size is None:
             args = [self.names[arg] for arg in node.args]
-            return [f"const {kind} {name} = {self.value(node, args)};"]
-        lines, loop = [f"{kind} {name}[{node.size}];"], LOOP.format(node.size)
+            return [(1, f"const {kind} {name} = {self.value(node, args)};")]
+        lines, loop = [(0, f"{kind} {name}[{size}];")], LOOP.format(size)
         if node.op == "pack":
-            return lines + [f"{name}[{i}] = {self.names[arg]};" for i, arg in enumerate(node.args)]
+            names = enumerate(self.names[arg] for arg in node.args)
+            return lines + [(1, f"{name}[{i}] = {arg};") for i, arg in names]
         if node.op == "concat":
             start = 0
             for part in node.args:
-                entry = self.entry_of(part, "i")
-                lines.append(f"{LOOP.format(part.size)}{name}[{start} + i] = {entry};")
-                start += part.size or 0
+                count, entry = part.size or 0, self.entry_of(part, "i")
+                lines.append((count, f"{LOOP.format(count)}{name}[{start} + i] = {entry};"))
+                start += count
             return lines
         if node.op == "matmul":
             return lines + self.product(node)
-        if node.op in ROWS:
+        if node.op in ROWS or node.op == "sums":
             return lines + self.of_rows(node)
-        if node.op == "sums":
-            return lines + self.sums(node)
         if node.op == "take":
             vector, index = node.args
             place = f"{self.names[index]}[i]"
             place = f"{int(index.value[0])} + i" if is_range(index) else place
-            return [*lines, f"{loop}{name}[i] = {self.entry_of(vector, place)};"]
+            return [*lines, (size, f"{loop}{name}[i] = {self.entry_of(vector, place)};")]
         each = [self.entry_of(arg, "i") if arg.size else self.names[arg] for arg in node.args]
-        return [*lines, f"{loop}{name}[i] = {self.value(node, each)};"]
+        return [*lines, (size, f"{loop}{name}[i] = {self.value(node, each)};")]
 
     def value(self, node: Node, args: list[str]) -> str:
         """A scalar, or an entry of a vector."""
         if node.op in ("item", "take"):
             return self.entry_of(node.args[0], node.value if node.op == "item" else args[1])
-        return self.form(node.op, node.args[0]).format(*args, p=self.prefix)
+        return self.form(node.op, node.args[0]).format(*args, **P)
 
     def form(self, op: str, first: Node) -> str:
         """How an operation is written, by its first argument."""
@@ -295,74 +297,56 @@ class _Printer:
             return self.arithmetic.forms[sure]
         return self.arithmetic.forms[op]
 
-    def product(self, node: Node) -> list[str]:
+    def product(self, node: Node) -> list[tuple[int, str]]:
         m, k, n = node.value
-        (a, b), name, arithmetic, p = node.args, self.names[node], self.arithmetic, self.prefix
+        (a, b), name, arithmetic = node.args, self.names[node], self.arithmetic
         entry, factor = f"{name}[r * {n} + c]", self.entry_of(a, f"r * {k} + i")
         other = f"{self.names[b]}[i * {n} + c]"
         if b in self.exact or not arithmetic.paired:
-            more = arithmetic.plus.format(entry, "factor", other, p=p)
+            more = arithmetic.plus.format(entry, "factor", other, **P)
         else:
-            forms = arithmetic.forms
-            more = forms["add"].format(entry, forms["mul"].format("factor", other, p=p), p=p)
+            product = arithmetic.forms["mul"].format("factor", other, **P)
+            more = arithmetic.forms["add"].format(entry, product, **P)
         each = f"for (int c = 0; c < {n}; ++c) {entry}"
-        summed = arithmetic.summed and arithmetic.summed.format(entry, p=p)
-        return [
-            f"for (int r = 0; r < {m}; ++r) {{",
-            f"    {each} = {arithmetic.zero.format(p=p)};",
-            f"    for (int i = 0; i < {k}; ++i) {{",
-            f"        const {self.real} factor = {factor};",
-            f"        {each} = {more};",
-            "    }",
-            *([f"    {each} = {summed};"] if summed else []),
-            "}",
+        lines = [
+            (0, f"for (int r = 0; r < {m}; ++r) {{"),
+            (m * n, f"    {each} = {arithmetic.zero};"),
+            (0, f"    for (int i = 0; i < {k}; ++i) {{"),
+            (m * k, f"        const {self.real} factor = {factor};"),
+            (m * k * n, f"        {each} = {more};"),
+            (0, "    }"),
         ]
+        if arithmetic.summed:
+            lines.append((m * n, f"    {each} = {arithmetic.summed.format(entry, **P)};"))
+        return [*lines, (0, "}")]
 
-    def of_rows(self, node: Node) -> list[str]:
+    def of_rows(self, node: Node) -> list[tuple[int, str]]:
+        """An operation along rows: its last result, or for ``sums`` all of them."""
         m, k = node.value
-        name, (arg,) = self.names[node], node.args
-        each = self.form(ROWS[node.op], node).format(
-            f"{name}[r]", self.entry_of(arg, f"r * {k} + i"), p=self.prefix
+        name, (arg,), running = self.names[node], node.args, node.op == "sums"
+        first, before, after = (
+            (f"r * {k}", f"r * {k} + i - 1", f"r * {k} + i") if running else ("r", "r", "r")
         )
+        each = self.form("add" if running else ROWS[node.op], node).format(
+            f"{name}[{before}]", self.entry_of(arg, f"r * {k} + i"), **P
+        )
+        start = self.entry_of(arg, f"r * {k}")
         return [
-            f"for (int r = 0; r < {m}; ++r) {{",
-            f"    {name}[r] = {self.entry_of(arg, f'r * {k}')};",
-            f"    for (int i = 1; i < {k}; ++i) {name}[r] = {each};",
-            "}",
+            (0, f"for (int r = 0; r < {m}; ++r) {{"),
+            (m, f"    {name}[{first}] = {start};"),
+            (m * (k - 1), f"    for (int i = 1; i < {k}; ++i) {name}[{after}] = {each};"),
+            (0, "}"),
         ]
-
-    def sums(self, node: Node) -> list[str]:
-        """Running sums of rows."""
-        m, k = node.value
-        name, (arg,) = self.names[node], node.args
-        entry = self.entry_of(arg, f"r * {k} + i")
-        each = self.form("add", node).format(f"{name}[r * {k} + i - 1]", entry, p=self.prefix)
-        return [
-            f"for (int r = 0; r < {m}; ++r) {{",
-            f"    {name}[r * {k}] = {self.entry_of(arg, f'r * {k}')};",
-            f"    for (int i = 1; i < {k}; ++i) {name}[r * {k} + i] = {each};",
-            "}",
-        ]
-
-    def cost(self, op: str, first: Node) -> int:
-        """Operations on floats, doubles or integers that an operation takes at most."""
-        return max(1, work(self.form(op, first), self.arithmetic.helpers))
 
     def counted(self) -> tuple[int, str]:
         """Operations of a step, and in words the calls of the C library."""
-        total, calls, arithmetic = 0, Counter[str](), self.arithmetic
+        total, calls = 0, Counter[str]()
         for node in self.program.steps:
-            if node.op in MOVES:
-                continue
-            count, first = node.size or 1, node.args[0]
-            if node.op == "matmul":
-                m, k, n = node.value
-                total += m * k * n * work(arithmetic.plus, arithmetic.helpers)
-            elif node.op in ROWS or node.op == "sums":
-                total += node.value[0] * node.value[1] * self.cost(ROWS.get(node.op, "add"), first)
-            else:
-                calls[arithmetic.functions.get(node.op, "")] += count
-                if arithmetic.paired or node.op not in arithmetic.functions:
-                    total += count * self.cost(node.op, first)
-        said = [f"{count} of {name}" for name, count in sorted(calls.items()) if name]
+            for times, line in self.lines(node):
+                statement = HEADS.sub("", line)
+                least = 0 if node.op in MOVES or " = " not in statement else 1
+                total += times * max(work(statement, self.arithmetic.helpers), least)
+            if called := self.arithmetic.functions.get(node.op):
+                calls[called] += node.size or 1
+        said = [f"{count} of {name}" for name, count in sorted(calls.items())]
         return total, f" and these calls:\n * {', '.join(said)}" if said else ""

@@ -25,7 +25,7 @@ __all__ = ["RunFolder", "refuse_no_group", "refuse_other"]
 # Where a run is, and how it is kept, may change when it goes on; what it computes must not.
 MAY_DIFFER = (
     "run", "runs", "seeds", "vmap", "checkpoint", "on_divergence", "max_rollbacks", "tensorboard",
-    "design", "devices",
+    "design", "devices", "hosts", "host", "coordinator",
 )  # fmt: skip
 INSTEAD = "choose another name or remove the folder"
 

@@ -8,7 +8,7 @@ import contextlib
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 __all__ = ["Stopped", "deferred", "stop_if_asked"]
 
@@ -57,9 +57,12 @@ def deferred() -> Iterator[None]:
         stop_if_asked()
 
 
-def stop_if_asked() -> None:
-    """Raise ``Stopped`` if a signal came since ``deferred`` began."""
-    if _asked:
-        signum = _asked[0]
+def stop_if_asked(agreed: Callable[[bool], bool] = bool) -> None:
+    """Raise ``Stopped`` if a signal came since ``deferred`` began.
+
+    ``agreed`` says whether several processes that loop together stop, given whether this one does.
+    """
+    if agreed(bool(_asked)):
+        signum = _asked[0] if _asked else signal.SIGTERM
         _asked.clear()
         raise Stopped(signum)

@@ -3,13 +3,15 @@
 import contextlib
 import dataclasses
 import math
+import tempfile
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from .. import devices
+from .. import devices, hosts
 from ..boards import Task, named_board, task_of
 from ..config import GradientRun, Run, SNESRun
 from ..controller import Controller
@@ -38,6 +40,7 @@ def train_stage(stage: Stage, runs: Sequence[SeedRun]) -> None:
 
     Raises:
         Stopped: a signal asked for it, and the runs are on disk.
+        hosts.Gone: another host is, and the runs are on disk.
     """
 
     def running():
@@ -49,7 +52,7 @@ def train_stage(stage: Stage, runs: Sequence[SeedRun]) -> None:
                 run.enter(stage)
         while behind := running():
             try:
-                stop_if_asked()
+                stop_if_asked(hosts.agreed)
             except Stopped as stop:
                 for run in behind:
                     run.checkpoint()
@@ -57,8 +60,13 @@ def train_stage(stage: Stage, runs: Sequence[SeedRun]) -> None:
             least = min(stage.done(run.state) for run in behind)
             group = [run for run in behind if stage.done(run.state) == least]
             before = runs[0].best_score
-            after = stage.advance([run.state for run in group])
-            rows = [run.take(stage, *done) for run, done in zip(group, after, strict=True)]
+            try:
+                after = stage.advance([run.state for run in group])
+                rows = [run.take(stage, *done) for run, done in zip(group, after, strict=True)]
+            except hosts.Gone:
+                for run in behind:
+                    run.checkpoint()
+                raise
             if any(r.folder.seconds - r.saved >= r.config.checkpoint.every for r in group):
                 for run in running():
                     run.checkpoint()
@@ -107,11 +115,32 @@ def train(
     Returns what ``result.json`` says; of several seeds, ``statistics.summary``, which is in
     ``seeds.json``. A run that is finished is not trained again.
 
+    Of several hosts the first writes the folder, and all return the same.
+
     Raises:
-        JaxpendError: the folder cannot be used or written, or training diverged.
+        JaxpendError: the folder cannot be used or written, training diverged, or another host is
+            gone, and everything is on disk.
         Stopped: a signal asked for it, and everything is on disk.
     """
+    hosts.join(config.hosts, config.host, config.coordinator)
     devices.use(config.devices)
+    with tempfile.TemporaryDirectory(prefix="jaxpend-") as scratch:
+        there = hosts.working_copy(config.folder, Path(scratch) / config.folder.name)
+        if there != config.folder:
+            config = dataclasses.replace(config, runs=str(there.parent), run=there.name)
+            console.quiet = True
+        try:
+            return _train(config, command, kinds)
+        except Stopped as stop:
+            text = f"{stop}; everything is in {there}; to go on: {command}"
+            raise Stopped(stop.signum, text) from None
+        except hosts.Gone as gone:
+            text = f"{gone}; everything is in {there}; to go on: {command}"
+            raise JaxpendError(text) from None
+
+
+def _train(config: Run, command: str, kinds: Sequence[type[Stage]]) -> dict[str, Any]:
+    """What ``train`` does on one host, on all alike."""
     names = (config.robot, config.plant, config.design, config.board, config.preset)
     task, start = task_of(*names), None
     if isinstance(config, GradientRun | SNESRun):
@@ -136,13 +165,9 @@ def train(
             else:
                 text = f"{run.folder.path} is finished: score {result['score']:.4f}"
                 console.print(text, soft_wrap=True)
-        try:
-            with deferred():
-                for group in [waiting] if vmap else [[run] for run in waiting]:
-                    train_group(group, stages)
-        except Stopped as stop:
-            text = f"{stop}; everything is in {config.folder}; to go on: {command}"
-            raise Stopped(stop.signum, text) from None
+        with deferred():
+            for group in [waiting] if vmap else [[run] for run in waiting]:
+                train_group(group, stages)
     failed = [run for run in runs if run.failed]
     results = [result for run in runs if (result := run.folder.result) is not None]
     if config.seeds == 1 and results:
