@@ -318,6 +318,7 @@ class Run(Checked):
         stage = {SACRun: "-sac", GradientRun: "-gradient", SNESRun: "-snes"}.get(type(self), "")
         seeds = f"s{self.seed}-{self.seed + self.seeds - 1}" if self.seeds > 1 else str(self.seed)
         task = "" if self.board == "v2" else f"-{self.board}"
+        task += "" if self.preset == "identified" else f"-{self.preset}"
         return Path(self.runs) / (self.run or f"{self.robot}{task}{stage}-seed{seeds}")
 
     def of_seeds(self) -> list["Run"]:

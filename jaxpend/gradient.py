@@ -270,6 +270,9 @@ class Gradient(SearchStage):
         super().__init__(config, policy, task)
         if not isinstance(task.scoring, ScoreV2):
             raise JaxpendError("the gradient climbs a smooth v2 score; this task has another score")
+        if task.chance:
+            text = "the gradient climbs the score of the nominal plant; here it is one of robots"
+            raise JaxpendError(f"{text} that differ: take SNES")
         if config.retention:
             _check_retention(policy)
             _check_time(config, task)

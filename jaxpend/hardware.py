@@ -1,7 +1,7 @@
 """A real robot: everything is a little wrong at once, from one robot to the next.
 
 A ``Spread`` says how far the parameters of a robot may be from those that were identified, and
-what its sensors and motor are like; ``PRESETS`` holds three. ``draw`` makes a scenario of it: one
+what its sensors and motor are like; ``PRESETS`` holds some. ``draw`` makes a scenario of it: one
 robot, which is the same for a whole run.
 """
 
@@ -43,7 +43,7 @@ class Spread:
 
     def __post_init__(self) -> None:
         most_of = {"inertial": 1.0, "friction": 1.0, "response": 1.0, "delay": LONGEST}
-        most_of["jitter"] = LONGEST - self.delay
+        most_of["jitter"] = round(LONGEST - self.delay, 9)
         for name, most in most_of.items():
             if not 0 <= getattr(self, name) <= most:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must be in 0 to {most:g}")
@@ -53,6 +53,11 @@ class Spread:
                      "compensation"):  # fmt: skip
             if not 0 <= getattr(self, name) < math.inf:
                 raise JaxpendError(f"{name} is {getattr(self, name)}; it must not be negative")
+        low, high = self.push
+        if not 0 <= low <= high < math.inf:
+            raise JaxpendError(f"push is {self.push}; it must be a range of N m, from 0 on")
+        if self.pushes != int(self.pushes) or self.pushes < 0:
+            raise JaxpendError(f"pushes is {self.pushes}; it must be a whole number, from 0 on")
 
 
 # "identified": as well as a robot is known after identification. "wide": as one that is not.

@@ -181,19 +181,28 @@ def check_values(scenario: Scenario) -> None:
     """Refuse numbers that mean nothing; one scenario or a batch. Traced values are not looked at.
 
     Raises:
-        JaxpendError: a negative noise, delay, responsiveness, width or torque limit, or a value
-            that is not finite (torque limits may be infinite).
+        JaxpendError: a negative noise, delay, responsiveness, width, filter or limit, a step of an
+            encoder that is not positive, or a value that is not finite (torque limits may be
+            infinite).
     """
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(scenario)):
         return
     scales = {name: getattr(scenario, name) for name in NEUTRAL if name != "pulses"}
     scales["torque_limit"] = scenario.plant.torque_limit
     scales["pulse width"] = None if scenario.pulses is None else scenario.pulses.width
+    if scenario.compensation is not None:
+        scales["limit of the compensation"] = scenario.compensation.limit
+    if scenario.encoder is not None:
+        scales["filter of the encoder"] = scenario.encoder.filtered
+        if not np.all(np.asarray(scenario.encoder.step) > 0):
+            step = np.min(scenario.encoder.step)
+            raise JaxpendError(f"step of the encoder is {step}; it must be positive")
     for name, value in scales.items():
         if value is not None and np.any(np.asarray(value) < 0):
             raise JaxpendError(f"{name} is {np.min(value)}; it must not be negative")
     for path, value in jax.tree_util.tree_leaves_with_path(scenario):
         name = jax.tree_util.keystr(path, simple=True, separator=" ")
-        bad = np.isnan(value) if name == "plant torque_limit" else ~np.isfinite(value)
+        limit = name.endswith("plant torque_limit")
+        bad = np.isnan(value) if limit else ~np.isfinite(value)
         if np.any(bad):
             raise JaxpendError(f"{name} holds a value that is not finite")

@@ -102,14 +102,15 @@ def nominal(controller: Controller, task: Task) -> Criteria:
 
 @partial(jax.jit, static_argnames="task")
 def trial_run(
-    controller: Controller, scenario: Scenario | None, task: Task
+    controller: Controller, scenario: Scenario | None, task: Task, seed: int | jax.Array = 0
 ) -> tuple[Trajectory, Criteria, jax.Array]:
     """A run on the time grid of a task, its criteria, and how hard it drove the passive joint.
 
     The last is the largest torque (), N m, that the controller wanted there. Without a scenario it
-    is on the nominal plant, whose numbers are then constants of the program.
+    is on the nominal plant, whose numbers are then constants of the program. ``seed`` () is that
+    of the noise.
     """
-    key, scenario = jax.random.key(0), scenario or Scenario(task.plant)
+    key, scenario = jax.random.key(seed), scenario or Scenario(task.plant)
     run = rollout(scenario, controller, key, dt=task.dt, duration=task.duration)
     passive = jnp.abs(run.u_command[:, 1 - task.joint])
     if scenario.resets is not None:
@@ -120,9 +121,11 @@ def trial_run(
 
 
 @partial(jax.jit, static_argnames="task")
-def _trials(controller: Controller, scenarios: Scenario, task: Task) -> tuple[Criteria, jax.Array]:
-    every = jax.vmap(lambda scenario: trial_run(controller, scenario, task)[1:])
-    return devices.split(every)(scenarios)
+def _trials(
+    controller: Controller, scenarios: Scenario, seeds: jax.Array, task: Task
+) -> tuple[Criteria, jax.Array]:
+    every = jax.vmap(lambda scenario, seed: trial_run(controller, scenario, task, seed)[1:])
+    return devices.split(every)(scenarios, seeds)
 
 
 @partial(jax.jit, static_argnames="task")
@@ -167,10 +170,10 @@ def official(controller: Controller, judged_on: Board | str) -> dict[str, Any]:
         for first in range(0, judged_on.draws, CHUNK):
             # The last ones are filled up, so that all share one program.
             seeds = np.arange(first, first + min(CHUNK, judged_on.draws))
-            seeds = np.minimum(seeds, judged_on.draws - 1).tolist()
-            scenarios = [judged_on.drawn(seed) for seed in seeds]
+            seeds = np.minimum(seeds, judged_on.draws - 1)
+            scenarios = [judged_on.drawn(seed) for seed in seeds.tolist()]
             batch = jax.tree.map(lambda *leaves: np.stack(leaves), *scenarios)
-            c, passive = devices.compute(_trials, ready, batch, task=task)
+            c, passive = devices.compute(_trials, ready, batch, seeds, task=task)
             _refuse_passive(float(passive.max()), task)
             found.append(jax.tree.map(np.asarray, c))
     count = judged_on.draws
@@ -197,14 +200,15 @@ def official_run(
 ) -> tuple[Trajectory, dict[str, Any]]:
     """A run that ``official`` judges, in float64, and its score, success and criteria.
 
-    ``seed`` is that of the draw, on a board of several; other arguments, and errors, are those of
-    ``official``.
+    ``seed`` is that of the draw, on a board of several: there it is the same robot and the same
+    resets as in ``official``, with noise of its own, since jax draws other numbers in float64.
+    Other arguments, and errors, are those of ``official``.
     """
     judged_on = board(judged_on)
     task = judged_on.task
     with jax.enable_x64(True):
         ready = _ready(controller, task)
-        run, c, passive = trial_run(ready, judged_on.drawn(seed), task)
+        run, c, passive = trial_run(ready, judged_on.drawn(seed), task, seed)
         _refuse_passive(float(passive), task)
         return run, _plain(c, task)
 

@@ -24,6 +24,7 @@ __all__ = ["Task"]
 # Of the key of resets: beyond the number of any part that the same key is split into elsewhere,
 # since ``fold_in(key, i)`` is the i-th of those.
 RESETS_STREAM = 2**31 - 7
+ROBOTS_STREAM = 2**31 - 9  # the same of the robot of a trial
 TRIALS = 16  # of a task in which chance plays: what a judgement in training is the mean of
 
 
@@ -54,6 +55,11 @@ class Task:
         if self.resets != int(self.resets) or not 0 <= self.resets <= max(most, 0):
             text = f"it must be a whole number, in {self.duration:g} s {max(most, 0)} at most"
             raise JaxpendError(f"resets is {self.resets}; {text}")
+        if self.resets and self.spread:
+            raise JaxpendError("a task has resets or robots that differ, not both")
+        if self.standing and not self.dt <= self.standing <= self.duration:
+            text = f"it must be 0, or {self.dt:g} to {self.duration:g} s"
+            raise JaxpendError(f"standing is {self.standing}; {text}")
 
     @property
     def plant(self) -> Plant:
@@ -96,8 +102,9 @@ class Task:
 
         Of a task with a ``spread`` it is a robot that ``key`` draws, which nobody pushes.
         """
-        scenario = Scenario(self.plant) if self.spread is None else self.robot_of(key)
-        return self._thrown(scenario, key)
+        if self.spread is not None:
+            return self.robot_of(jax.random.fold_in(key, ROBOTS_STREAM))
+        return self._thrown(Scenario(self.plant), key)
 
     def robot_of(self, key: jax.Array, plant: Plant | None = None, pushed: Any = False) -> Scenario:
         """A robot of a task with a ``spread``, around its plant; ``key`` is consumed."""

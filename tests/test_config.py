@@ -45,7 +45,7 @@ UNLIMITED = {
     ("GradientConfig", "memory"): math.inf,
 }
 # Text that is looked at where it is used: names of files and of parts of a network.
-FREE_TEXT = {"run", "runs", "plant", "design", "policy", "controller", "searched"}
+FREE_TEXT = {"coordinator", "run", "runs", "plant", "design", "policy", "controller", "searched"}
 
 
 def wrong_values(kind: type, name: str) -> list:
@@ -296,7 +296,8 @@ def test_the_recipes_are_valid_for_every_training_command():
     )
     for name, kind in itertools.product(recipes(), (SACRun, SNESRun, TrainRun)):
         run = load_config(kind(), name, SECTIONS)
-        assert run.robot == (name.rpartition("_")[2] if name != "plain" else "pendubot")
+        named = name.rpartition("_")[2]
+        assert run.robot == (named if named in robots else "pendubot")
         board = {"global": "v3", "hardware": "hardware"}.get(name.partition("_")[0], "v2")
         assert run.board == board
         if kind is not SACRun:

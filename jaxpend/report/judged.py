@@ -12,6 +12,7 @@ from ..boards import HEADINGS, Board, Task
 from ..controllers.catalogue import find_controller
 from ..controllers.files import read_header
 from ..fleet import judge_fleet
+from ..hardware import PRESETS
 from ..plant import forward_kinematics
 from ..robots import ROBOTS
 from ..robustness import benchmark
@@ -42,8 +43,8 @@ class Judged:
 
     @property
     def up(self) -> float | None:
-        """Swing-up time, s; None without success, and where resets follow it."""
-        stands = self.success and not self.task.resets
+        """Swing-up time, s; None without success, and where it is not that of one run."""
+        stands = self.success and not self.task.chance
         return self.criteria["swingup_time"] if stands else None
 
     @property
@@ -53,8 +54,8 @@ class Judged:
 
     @property
     def reach(self) -> float:
-        """What the end effector reaches when it is stretched, m."""
-        return float(self.task.plant.length.sum())
+        """What the end effector of the robot reaches when it is stretched, m."""
+        return float(np.linalg.norm(np.diff(self.points[0], axis=0, prepend=0), axis=-1).sum())
 
     @property
     def whole(self) -> float:
@@ -92,14 +93,16 @@ def judge(
     found = partial(find_controller, policy, controller, task)
     with jax.enable_x64(True):
         trajectory, said = official_run(found(), board)
-        points = jax.vmap(forward_kinematics, (None, 0))(task.plant, trajectory.x)
+        plant = task.plant if (drawn := board.drawn(0)) is None else drawn.plant
+        points = jax.vmap(forward_kinematics, (None, 0))(plant, trajectory.x)
     if board.draws > 1:
         said = official(found(), board)
     if robustness and board.trials is not None:
         report = {"robot": run.robot} | benchmark(found(), board, jax.random.key(0)).as_dict()
     if robustness and task.spread is not None:
         many = judge_fleet(found(), task, jax.random.key(0), robots=ROBOTS_JUDGED)
-        fleet = {"robot": run.robot, "preset": board.name} | many.as_dict()
+        preset = next((n for n, spread in PRESETS.items() if spread == task.spread), board.name)
+        fleet = {"robot": run.robot, "preset": preset} | many.as_dict()
     x = np.asarray(trajectory.x)
     samples = np.isfinite(x).all(axis=1).cumprod().sum()  # the first one is the start
     return Judged(

@@ -137,7 +137,9 @@ def _board(run: RunRecord) -> Board:
     spread = PRESETS.get(str(run.config.get("preset")))
     if spread and official.task.spread:
         task = dataclasses.replace(official.task, spread=spread)
-        official = dataclasses.replace(official, task=task)
+        name = f"{official.name}, {run.config['preset']}"
+        name = official.name if spread == official.task.spread else name
+        official = dataclasses.replace(official, name=name, task=task)
     if not plant or plant == dict(official.task.parameters):
         return official
     name = run.config.get("plant") or run.config.get("design") or "a plant of its own"
