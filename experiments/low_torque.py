@@ -57,7 +57,7 @@ def learned(robot: str, limit: float, runs: Path) -> dict:
 
 def optimised(robot: str, limit: float, runs: Path, starts: int) -> dict:
     """The best swing-up within a limit."""
-    kept = runs / f"optimised-{robot}-{limit:g}.json"
+    kept = runs / f"optimised-{robot}-{limit:g}-{starts}.json"
     if not kept.exists():
 
         def say(line):
@@ -94,10 +94,11 @@ def draw_over_limits(axes, rows: list[dict], robot: str, name: str) -> None:
         mine = [r for r in rows if r["robot"] == robot and name in r[kind]]
         x, y = [r["limit"] for r in mine], [r[kind][name] for r in mine]
         axes.plot(x, y, form, color=PALETTE[colour], label=label, markersize=5)
+    limits = list(dict.fromkeys(row["limit"] for row in rows))
     if name == "max_tau":
-        axes.plot(LIMITS, LIMITS, color=PALETTE["muted"], linewidth=0.8, label="the limit")
+        axes.plot(limits, limits, color=PALETTE["muted"], linewidth=0.8, label="the limit")
     axes.set(title=f"{robot}: {SHOWN[name]}", xlabel="torque limit [N m]", xscale="log")
-    axes.set_xticks(LIMITS, [f"{limit:g}" for limit in LIMITS])
+    axes.set_xticks(limits, [f"{limit:g}" for limit in limits])
     axes.minorticks_off()
     axes.set_ylim(bottom=0)
     axes.legend(fontsize=8)

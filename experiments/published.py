@@ -16,12 +16,13 @@ import jax
 import numpy as np
 
 from jaxpend import Policy, cli, leaderboard
-from jaxpend.boards import Task, strips, v2
+from jaxpend.boards import strips, v2
 from jaxpend.fields import Count, Natural, Seed
 from jaxpend.files import write_atomically
 from jaxpend.interop.stable_baselines3 import declared, read_model
 from jaxpend.robots import ROBOTS
 from jaxpend.sweep import survey
+from jaxpend.task import Task
 from jaxpend.terminal import console
 
 HERE = Path(__file__).parent

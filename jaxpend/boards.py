@@ -1,8 +1,7 @@
-"""Tasks and boards as values: what is controlled and how it is scored; what is published of it.
+"""Boards as values: a task with its official trials, and what is published of it.
 
-A ``Task`` is all that a learner may know: environment, SAC, SNES, gradient and trajectory
-optimisation take one. A ``Board`` is a task with the official trials and the published rows; what
-judges takes one. So training cannot touch official keys or grids, and another board is a value.
+What judges takes a ``Board``; what learns takes its ``task.Task`` alone, so that training cannot
+touch official keys or grids, and another board is a value.
 """
 
 import dataclasses
@@ -32,7 +31,7 @@ from .task import Task
 from .variations import RANGES
 
 __all__ = [
-    "BOARDS", "CRITERIA", "HARDWARE", "HEADINGS", "V2", "V3", "Board", "Strip", "Task", "board",
+    "BOARDS", "CRITERIA", "HARDWARE", "HEADINGS", "V2", "V3", "Board", "Strip", "board",
     "hardware", "named_board", "own_task", "strips", "task_of", "v2", "v3",
 ]  # fmt: skip
 

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .boards import Task
 from .config import LINES, EnvConfig, Reward
 from .plant import (
     Plant,
@@ -30,6 +29,7 @@ from .pytree import Pytree, pytree
 from .resets import thrown
 from .rollout import SLOTS, Sensors, actuate, draws, measure, sensors
 from .scenario import DT, Scenario
+from .task import Task
 from .trigonometry import sincos
 
 __all__ = [

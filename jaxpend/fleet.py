@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import devices
-from .boards import Task
 from .controller import Controller, check_controller, check_form, check_robot
 from .criteria import Criteria
 from .errors import JaxpendError
@@ -24,6 +23,7 @@ from .plant import Plant, tip_height
 from .rollout import rollout
 from .scenario import DT, Scenario
 from .sweep import at_least_one
+from .task import Task
 
 __all__ = ["CONDITIONS", "Fleet", "judge_fleet", "off", "wilson"]
 

@@ -28,7 +28,7 @@ import numpy as np
 import optax
 
 from . import devices
-from .boards import Task, own_task
+from .boards import own_task
 from .config import GradientConfig, Run, TrainRun
 from .controller import Controller, check_controller
 from .controllers.policy import Policy
@@ -40,6 +40,7 @@ from .pytree import Pytree, pytree
 from .rollout import rollout
 from .scenario import Scenario
 from .stage import Candidates, Chart, Row, SearchStage, SearchState, Stage
+from .task import Task
 from .trajopt.swingup import SwingUp, smooth_score, totals
 
 __all__ = [
@@ -218,10 +219,8 @@ _watched = jax.jit(retained, static_argnames=("config", "task"))
 
 def _check_retention(controller: Controller) -> None:
     if not isinstance(controller, Policy):
-        text = "it needs a policy without a guard, and not"
-        raise JaxpendError(
-            f"retention keeps actions of a network; {text} {type(controller).__name__}"
-        )
+        text = "retention keeps actions of a network; it needs a policy without a guard, and not"
+        raise JaxpendError(f"{text} {type(controller).__name__}")
 
 
 @partial(jax.jit, static_argnames=("config", "steps", "task"))
@@ -268,11 +267,9 @@ class Gradient(SearchStage):
     def __init__(self, config: GradientConfig, policy: Any, task: Task):
         """Raises ``JaxpendError`` as ``init``."""
         super().__init__(config, policy, task)
-        if not isinstance(task.scoring, ScoreV2):
-            raise JaxpendError("the gradient climbs a smooth v2 score; this task has another score")
-        if task.chance:
-            text = "the gradient climbs the score of the nominal plant; here it is one of robots"
-            raise JaxpendError(f"{text} that differ: take SNES")
+        if task.chance or not isinstance(task.scoring, ScoreV2):
+            text = "the gradient climbs a smooth v2 score of the nominal plant"
+            raise JaxpendError(f"{text}; this task has another score")
         if config.retention:
             _check_retention(policy)
             _check_time(config, task)

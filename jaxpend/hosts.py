@@ -18,6 +18,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.extend.backend import clear_backends
 
 from .errors import JaxpendError
 
@@ -74,6 +75,7 @@ def join(hosts: int, host: int, coordinator: str) -> None:
     late = threading.Timer(WAIT, _give_up, (f"not all hosts are here after {WAIT} s",))
     late.daemon = True
     late.start()
+    clear_backends()  # who looked whether a platform is there has begun one
     try:
         jax.distributed.initialize(**options)
     except (RuntimeError, ValueError) as error:

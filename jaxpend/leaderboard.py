@@ -12,13 +12,14 @@ from typing import Any
 
 import jax
 
-from .boards import HEADINGS, Board, Task
+from .boards import HEADINGS, Board
 from .controller import Controller
 from .controllers.catalogue import CATALOGUE, build, find_controller
 from .errors import JaxpendError, choose
 from .plant import Plant
 from .robustness import CRITERIA, KEYS, benchmark
 from .score import official
+from .task import Task
 
 __all__ = ["cells", "chosen", "judge", "leaderboard", "markdown", "published"]
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import devices
-from .boards import Board, Task, board
+from .boards import Board, board
 from .config import Objective
 from .controller import Controller, check_controller, check_form, check_robot
 from .criteria import (
@@ -33,6 +33,7 @@ from .pytree import in_default
 from .resets import held
 from .rollout import Trajectory, rollout
 from .scenario import Scenario
+from .task import Task
 
 __all__ = [
     "V1_DEFAULT", "V1_OFFICIAL", "V2_HARDWARE", "V2_OFFICIAL", "Criteria", "ScoreV2", "ScoreV3",

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import optax
 
 from . import devices
-from .boards import Task, own_task
+from .boards import own_task
 from .config import STRATEGIES, GuardConfig, Run, SNESConfig, SNESRun
 from .controller import Controller, check_controller
 from .controllers.guard import guard
@@ -28,6 +28,7 @@ from .errors import JaxpendError
 from .pytree import Pytree, pytree
 from .score import combined, imperfect, performance
 from .stage import Candidates, Chart, Row, SearchStage, SearchState
+from .task import Task
 
 __all__ = [
     "SNES", "SNESConfig", "SNESState", "best_controller", "evolve", "fitness", "init",
@@ -193,7 +194,7 @@ class SNES(SearchStage):
     """The stage of training: SNES from any controller, which is guarded before the search.
 
     Judged, by ``stage.value``, are the mean controller and the best individual so far; both are
-    also scored on the nominal plant and, for the metrics, on fresh noise.
+    also scored as ``score.nominal`` does and, for the metrics, on fresh noise.
     """
 
     name, title, unit, column = "snes", "SNES", "generations", "generation"

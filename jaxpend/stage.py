@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 
 from . import devices
-from .boards import Task
 from .config import Objective, Run
 from .controller import Controller
 from .controllers.search_space import kinds
 from .pytree import Pytree, pytree
 from .score import combined, imperfect, nominal
+from .task import Task
 
 __all__ = ["Candidates", "Chart", "Row", "SearchStage", "SearchState", "Stage", "value"]
 

@@ -1,4 +1,7 @@
-"""A task: what is controlled and how it is scored, which is all that a learner may know."""
+"""A task: what is controlled and how it is scored, which is all that a learner may know.
+
+Environment, SAC, SNES, gradient and trajectory optimisation take one.
+"""
 
 import dataclasses
 from collections.abc import Callable, Mapping

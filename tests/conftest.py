@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 
 from jaxpend import JaxpendError
-from jaxpend.boards import Task, v2
+from jaxpend.boards import v2
 from jaxpend.plant import Plant
+from jaxpend.task import Task
 
 hypothesis.settings.register_profile("jaxpend", deadline=None, max_examples=40, derandomize=True)
 hypothesis.settings.load_profile("jaxpend")

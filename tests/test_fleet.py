@@ -294,7 +294,7 @@ def test_tasks_and_sensors_that_make_no_sense_are_refused():
             dataclasses.replace(TASK, standing=standing)
     with refused("resets or robots that differ, not both"):
         dataclasses.replace(TASK, resets=2)
-    with refused("the gradient climbs the score of the nominal plant"):
+    with refused("the gradient climbs a smooth v2 score of the nominal plant"):
         Gradient(GradientConfig(steps=1), load_policy("hardware_pendubot"), TASK)
     robot = jax.tree.map(lambda leaf: leaf[0], drawn(PRESETS["compensated"], 1, False))
     check_values(robot)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import refused
 
-from jaxpend.boards import Task, v2, v3
+from jaxpend.boards import v2, v3
 from jaxpend.cli.app import main
 from jaxpend.config import EnvConfig, GradientConfig, TrainRun
 from jaxpend.controller import Feedback, Zero
@@ -25,6 +25,7 @@ from jaxpend.resets import Resets, held, official_resets, random_resets, stamps,
 from jaxpend.rollout import rollout
 from jaxpend.scenario import Scenario
 from jaxpend.score import imperfect, nominal, official, official_run, recorded, trial_run
+from jaxpend.task import Task
 
 ROBOTS = ("acrobot", "pendubot")
 

@@ -131,7 +131,7 @@ def test_seeds_in_one_vmap_stop_resume_and_come_to_what_they_come_to_alone(tmp_p
     together = dataclasses.replace(config, run="together", vmap="yes")
     looks = []
 
-    def look():
+    def look(agreed):
         looks.append(None)
         if len(looks) == 2:
             raise Stopped(signal.SIGINT)

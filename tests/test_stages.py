@@ -162,7 +162,7 @@ def test_a_new_stage_is_one_class(tmp_path, monkeypatch, capfd):
     run = dataclasses.replace(run, tensorboard=True)
     looks = iter([None, None, Stopped(signal.SIGINT)])
 
-    def look():
+    def look(agreed):
         if (now := next(looks, None)) is not None:
             raise now
 

@@ -10,6 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "jaxpend"
 # line may import each other, as long as there is no circle.
 LAYERS = """
 errors files arrays robots pytree fields trigonometry observation config config_files terminal
+hosts
 devices
 plant
 designs resets

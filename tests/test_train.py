@@ -256,7 +256,7 @@ def test_snes_fine_tunes_any_controller_and_goes_on_where_it_was(monkeypatch, tm
     run = dataclasses.replace(run, run="stopped")
     calls = iter([None, Stopped(signal.SIGINT)])
 
-    def stop():
+    def stop(agreed):
         if (now := next(calls, None)) is not None:
             raise now
 

@@ -130,8 +130,8 @@ def score(
 
     Args:
         robot: which joint is driven: the second of the acrobot, the first of the pendubot.
-        board: v2; v3, the one of global policies; or hardware, the plant of the real robots with
-            their normalisation (how many robots stand: jaxpend hardware).
+        board: v2; v3, the one of global policies; or hardware, real robots that differ, with
+            their normalisation (how many of them stand: jaxpend hardware).
         policy: a policy or controller file; by default the policy that ships with the package.
         controller: judge this instead: a known one such as tvlqr, or module:name of a
             controller, of one written for RealAIGym, or of a Python function (t, x) -> torque.
@@ -139,7 +139,7 @@ def score(
         plant: YAML file of the parameters of another plant than that of the boards.
         design: or an identified plant by name, such as C.1/1.0.
         seed: on a board on which chance plays, judge this draw alone, in float64.
-        draws: or the first so many; by default all of the board, 1000 of v3.
+        draws: or the first so many; by default all: 1000 of v3, 200 robots of hardware.
         csv: judge this recorded trajectory instead, a file in the layout of RealAIGym.
         hardware: with the normalisation for real robots; a recording may then have a clock
             that is not exact.
@@ -250,7 +250,7 @@ def leaderboard(
     Args:
         robot: which joint is driven: the second of the acrobot, the first of the pendubot.
         board: v2; or v3, of global policies, or hardware, which have no robustness benchmark.
-        draws: of v3, to take the mean of; by default 1000, which takes MPC hours.
+        draws: of v3 or hardware, to take the mean of; by default 1000 and 200.
         controllers: names separated by commas; by default all that are known.
         policy: a policy or controller file to judge as well.
         controller: or another one to judge as well, as in jaxpend score.

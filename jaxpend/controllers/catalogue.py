@@ -8,10 +8,10 @@ from pathlib import Path
 
 import jax.numpy as jnp
 
-from ..boards import Task
 from ..controller import Controller, OpenLoop, check_controller, check_robot
 from ..errors import THEIRS, JaxpendError, blame, choose
 from ..plant import Plant
+from ..task import Task
 from ..trajopt.reference import Reference, load_reference
 from .callback import PythonLaw, is_realaigym, realaigym
 from .energy import energy_shaping

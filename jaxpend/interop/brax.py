@@ -6,9 +6,10 @@ import io
 import jax
 import jax.numpy as jnp
 
-from ..boards import Task, v2
+from ..boards import v2
 from ..env import Env as Functions
 from ..env import EnvConfig, EnvState
+from ..task import Task
 
 # MuJoCo, which Brax loads, prints what it lacks to standard output.
 with contextlib.redirect_stdout(io.StringIO()):

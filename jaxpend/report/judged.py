@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..boards import HEADINGS, Board, Task
+from ..boards import HEADINGS, Board
 from ..controllers.catalogue import find_controller
 from ..controllers.files import read_header
 from ..fleet import judge_fleet
@@ -18,6 +18,7 @@ from ..robots import ROBOTS
 from ..robustness import benchmark
 from ..runs.reader import RunRecord
 from ..score import official, official_run
+from ..task import Task
 
 __all__ = ["Judged", "criteria_costs", "held", "judge"]
 

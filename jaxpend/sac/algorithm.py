@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import optax
 
 from .. import devices
-from ..boards import Task
 from ..config import SACConfig
 from ..controllers.policy import Policy
 from ..env import Env, EnvState, restarted, truncated
 from ..pytree import Pytree, pytree
+from ..task import Task
 from . import losses, replay
 from .critics import Critic, TwinCritic
 from .demonstrations import Imitation, imitate, imitation, swingups

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 
 from .. import devices
-from ..boards import Task
 from ..config import Run, SACConfig
 from ..controller import Controller
 from ..pytree import Pytree, pytree
 from ..score import nominal
 from ..stage import Candidates, Chart, Row, Stage, value
+from ..task import Task
 from . import algorithm
 from .algorithm import Agent, SACState
 

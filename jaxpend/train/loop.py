@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from .. import devices, hosts
-from ..boards import Task, named_board, task_of
+from ..boards import named_board, task_of
 from ..config import GradientRun, Run, SNESRun
 from ..controller import Controller
 from ..controllers.catalogue import find_controller
@@ -24,6 +24,7 @@ from ..runs.statistics import summary
 from ..sac.stage import SAC, Imitation
 from ..snes import SNES
 from ..stage import Stage
+from ..task import Task
 from ..terminal import LiveProgress, console
 from .interrupt import Stopped, deferred, stop_if_asked
 from .seed_run import SeedRun

@@ -18,12 +18,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..boards import Board, Task
+from ..boards import Board
 from ..config import Search
 from ..controllers.lqr import lqr
 from ..controllers.tvlqr import tvlqr
 from ..errors import JaxpendError
 from ..score import official
+from ..task import Task
 from . import ilqr, swingup
 from .reference import Reference
 

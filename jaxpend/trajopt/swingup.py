@@ -19,11 +19,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ..boards import Task
 from ..criteria import ScoreV2
 from ..errors import JaxpendError
 from ..plant import Plant, forward_kinematics, joint_torque, rk4_step
 from ..pytree import Pytree, pytree, static
+from ..task import Task
 from .ilqr import Problem
 
 __all__ = ["SwingUp", "problem", "smooth_score", "step", "totals"]
