@@ -29,7 +29,7 @@ CONFIG_OF_RECIPE = $(or $(CONFIG_$(RECIPE)),$(error RECIPE is '$(RECIPE)'; it mu
 CONFIG_demonstrated := $(ROBOT)
 CONFIG_learned := learned_$(ROBOT)
 CONFIG_plain := plain
-CONFIG_low_torque := low_torque
+CONFIG_low_torque := low_torque_$(ROBOT)
 
 .DEFAULT_GOAL := help
 .PHONY: help install train snes score robustness hardware leaderboard runs report docs test lint bench clean

@@ -1,4 +1,4 @@
-"""How little torque a swing-up needs: the recipe `low_torque` over torque limits.
+"""How little torque a swing-up needs: the recipes `low_torque_ROBOT` over torque limits.
 
     python experiments/low_torque.py
 
@@ -46,7 +46,7 @@ def learned(robot: str, limit: float, runs: Path) -> dict:
     """A run of the recipe within a limit: what every stage came to."""
     folder = runs / f"{robot}-{limit:g}"
     if not (folder / "result.json").exists():
-        line = [sys.executable, "-m", "jaxpend", "train", "--config", "low_torque"]
+        line = [sys.executable, "-m", "jaxpend", "train", "--config", f"low_torque_{robot}"]
         line += ["--robot", robot, "--sac.env.torque-limit", str(limit), "--devices", "1"]
         line += ["--runs", str(runs), "--run", folder.name]
         subprocess.run(line, check=True, env=os.environ | {"XLA_FLAGS": THREAD})
