@@ -109,8 +109,8 @@ def guarded() -> Iterator[None]:
 
 
 def leave(code: int) -> None:
-    """End the process where another host is gone: JAX would wait for it, and then abort."""
-    if _lost:
+    """End the process where it or another host failed: JAX would wait for all, then abort."""
+    if _lost or (code == 2 and jax.distributed.is_initialized()):
         sys.stderr.flush()
         os._exit(code)
 
