@@ -63,7 +63,8 @@ def test_policies_are_policy_files(tmp_path):
     save_controller(path, policy, "acrobot")
     same(load_policy(path), policy)
     same(load_controller("acrobot"), policy)
-    hybrid = with_lqr(network_in(policy), PLANT, "acrobot")
+    plant = designs.competition("acrobot")
+    hybrid = with_lqr(network_in(policy), plant, "acrobot")
     for save in (
         lambda: save_controller(path, hybrid, "acrobot"),
         lambda: save_policy(path, hybrid),
@@ -73,7 +74,9 @@ def test_policies_are_policy_files(tmp_path):
         same(load_policy(path, robot="acrobot"), hybrid)
     same(network_in(load_policy(path)), network_in(policy))
     with pytest.raises(JaxpendError, match="holds 0 neural networks; one is needed"):
-        network_in(lqr(PLANT, "acrobot"), path)
+        network_in(lqr(plant, "acrobot"), path)
+    with refused("no LQR: joint 2 of this plant has no motor, as the acrobot has"):
+        lqr(PLANT, "acrobot")
 
 
 def test_a_users_own_class_must_be_given(tmp_path):

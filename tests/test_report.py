@@ -520,14 +520,14 @@ def test_the_page_on_real_robots_shows_which_of_them_stand(tmp_path, monkeypatch
     commands.report(Path("hardware_pendubot"), out=tmp_path)
     text = (tmp_path / "report.html").read_text()
     assert "12 robots, tried twice" in text
-    kept = json.loads((tmp_path / "report" / "hardware_pendubot.json").read_text())
+    kept = json.loads((tmp_path / "report" / "identified_pendubot.json").read_text())
     for name, found in kept["conditions"].items():
         row = rf"<td>{name}</td><td>{100 * found['success']:.1f} %</td>"
         assert re.search(row, text)
     assert text.count('<th scope="row">delay [s]</th>') == 1
     assert "the robot of seed 0" in text
     assert "mean of 2 draws" in text
-    with Image.open(tmp_path / "report" / "hardware_pendubot.png") as picture:
+    with Image.open(tmp_path / "report" / "identified_pendubot.png") as picture:
         assert picture.width > 500
 
 

@@ -102,6 +102,9 @@ def lqr(
         raise JaxpendError(f"LQR needs q of 4 values >= 0, r > 0 and dt > 0; got {q}, {r}, {dt}")
     dtype = jnp.result_type(plant.mass)
     a, b = _upright(plant, joint, dt)
+    if not b.any():
+        text = f"joint {joint + 1} of this plant has no motor, as the {robot} has"
+        raise JaxpendError(f"no LQR: {text}")
     try:
         if dt is None:
             p = solve_continuous_are(a, b, np.diag(weights), r * np.eye(1))
