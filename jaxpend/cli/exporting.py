@@ -39,7 +39,7 @@ def export(
         out: file to write; for realaigym a folder, whose name the submission has.
         precision: of c float32 unless told, which computes with pairs of floats, for torques within
             1e-5 N m of those here; float64, within 1e-9; single, one float for a number, the
-            fastest: a guard's observer multiplies rounding, so that it is within 3e-3 there. Of
+            fastest: a guard's observer multiplies rounding, so that it is within 4e-3 there. Of
             onnx float64 unless told, or float32, as close as single. numpy has float64 alone.
     """
     chosen = precision or PRECISIONS[to][0]

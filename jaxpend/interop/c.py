@@ -13,9 +13,9 @@ that of jax in float64, whatever the controller,
 - in "float32" by less than 1e-5 N m: float goes in and comes out, and pairs of floats compute, so
   that a processor that has nothing else can keep up;
 - in "float64" by less than 1e-9 N m, and so does the loop that it closes;
-- in "single", one float for a number, which is the fastest, a policy by some 1e-5 N m and a
-  guarded one by up to 3e-3 N m: an observer multiplies the rounding of an angle (2e-7 rad) by the
-  rate of its calls. Jax itself differs by as much in float32 from one compilation to the next.
+- in "single", one float for a number, which is the fastest, by 1e-6 to 4e-3 N m: an observer
+  multiplies the rounding of an angle (2e-7 rad) by the rate of its calls. Jax in float32 is as far
+  off, and differs by as much from one compilation to the next.
 
 A loop that is closed through measurements in float drifts apart while it swings up, because the
 motion multiplies their rounding too. ``experiments/export.py`` measures all this.
