@@ -29,6 +29,7 @@ WAIT = 60  # s, for all to arrive
 SILENCE = 50
 
 _lost = False  # whether another one is gone
+_stopping = False  # whether all stop together
 
 
 class Gone(JaxpendError):
@@ -54,7 +55,7 @@ def join(hosts: int, host: int, coordinator: str) -> None:
     """Compute together with other processes from now on.
 
     It comes before anything is computed. Where the others do not arrive within a minute, the
-    process ends with one sentence and exit code 2, which is not in JAX's power.
+    process ends here, with one sentence and exit code 2: JAX would abort it without an exception.
 
     Args:
         hosts: how many there are; 1: this one alone; 0: as the cluster says, whose environment
@@ -109,20 +110,22 @@ def guarded() -> Iterator[None]:
 
 
 def leave(code: int) -> None:
-    """End the process where it or another host failed: JAX would wait for all, then abort."""
-    if _lost or (code == 2 and jax.distributed.is_initialized()):
+    """End the process, unless all stop together: JAX would wait for the others, then abort."""
+    if _lost or (not _stopping and jax.distributed.is_initialized()):
         sys.stderr.flush()
         os._exit(code)
 
 
 def agreed(asked: bool) -> bool:
-    """Whether any host says so."""
+    """Whether any host is asked to stop, so that all do."""
+    global _stopping
     if jax.process_count() == 1:
         return asked
     from jax.experimental.multihost_utils import process_allgather
 
     with guarded():
-        return bool(np.asarray(process_allgather(np.asarray(asked))).any())
+        _stopping = bool(np.asarray(process_allgather(np.asarray(asked))).any())
+    return _stopping
 
 
 def working_copy(folder: Path, copy: Path) -> Path:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -127,3 +128,22 @@ def test_alone_nothing_changes(tmp_path):
     assert [hosts.agreed(asked) for asked in (False, True)] == [False, True]
     assert hosts.working_copy(tmp_path, tmp_path / "copy") == tmp_path
     assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("joined", "lost", "stopping", "ends"),
+    [
+        (False, False, False, False),
+        (True, False, False, True),  # it failed, or was interrupted alone
+        (True, False, True, False),
+        (True, True, True, True),
+    ],
+)
+def test_who_fails_does_not_wait_for_the_others(monkeypatch, joined, lost, stopping, ends):
+    ended = []
+    monkeypatch.setattr(os, "_exit", ended.append)
+    monkeypatch.setattr(jax.distributed, "is_initialized", lambda: joined)
+    monkeypatch.setattr(hosts, "_lost", lost)
+    monkeypatch.setattr(hosts, "_stopping", stopping)
+    hosts.leave(130)
+    assert ended == ([130] if ends else [])
