@@ -33,12 +33,12 @@ import numpy as np
 from jaxpend import designs, leaderboard, load_policy
 from jaxpend.boards import v2
 from jaxpend.cli import emit_json
-from jaxpend.config import STRATEGIES, GradientConfig, Objective, SACRun, SNESConfig
+from jaxpend.config import GradientConfig, Objective, SACRun, SNESConfig
 from jaxpend.config_files import load_config
 from jaxpend.controllers import guard
 from jaxpend.files import write_atomically
 from jaxpend.gradient import Gradient
-from jaxpend.snes import SNES
+from jaxpend.snes import SNES, STRATEGIES
 from jaxpend.sweep import sweep
 from jaxpend.terminal import console
 from jaxpend.train.loop import train

@@ -27,34 +27,23 @@ from .fields import (
 from .observation import Observation
 
 __all__ = [
-    "ACTIVATIONS", "LINES", "STRATEGIES", "Activation", "CheckpointConfig",
-    "DemonstrationConfig", "EnvConfig", "GradientConfig", "GradientRun", "GuardConfig",
-    "Objective", "Reward", "Run", "SACConfig", "SACRun", "SNESConfig", "SNESRun", "Search",
-    "TrainRun",
+    "ACTIVATIONS", "Activation", "CheckpointConfig", "DemonstrationConfig", "EnvConfig",
+    "GradientConfig", "GradientRun", "GuardConfig", "Objective", "OpeningsConfig", "Reward", "Run",
+    "SACConfig", "SACRun", "SNESConfig", "SNESRun", "Search", "SearchRun", "TrainRun",
 ]  # fmt: skip
 
 Activation = Literal["relu", "tanh", "silu"]
 ACTIVATIONS: tuple[str, ...] = get_args(Activation)
 Strategy = Literal["snes", "sep_cma_es", "lm_ma_es", "open_es"]
-STRATEGIES = {  # and what evosax calls them
-    "snes": "SNES",
-    "sep_cma_es": "Sep_CMA_ES",
-    "lm_ma_es": "LM_MA_ES",
-    "open_es": "Open_ES",
-}
-
 Duration = Annotated[float, Bounds(least=0.01, most=3600)]  # s
 PositiveOrInfinite = Annotated[float, Bounds(above=0, infinite=True)]
-
-# The paper's heights of the end effector above which the reward asks for balance, m.
-LINES = {"acrobot": 0.375, "pendubot": 0.35}
 
 
 @dataclasses.dataclass(frozen=True)
 class Reward(Checked):
     """Coefficients of the surrogate reward; see jaxpend.env.surrogate_reward."""
 
-    line: float | None = None  # m, height that separates the regimes; None: see ``LINES``
+    line: float | None = None  # m, height that separates the regimes; None: ``env.LINES``
     alpha: NotNegative = 2.0  # J, straight elbow above the line
     beta: NotNegative = 1.0  # kinetic energy above the line
     rho1: NotNegative = 0.1  # action squared, above the line
@@ -244,6 +233,18 @@ class CheckpointConfig(Checked):
 
 
 @dataclasses.dataclass(frozen=True)
+class OpeningsConfig(Checked):
+    """How other ways to begin are tried and learned; see ``jaxpend.openings``."""
+
+    count: Natural = 0  # openings that a policy learns; 0: ``train`` leaves the stage out
+    longest: Duration = 1.2  # s
+    rounds: Count = 12  # of watching and imitating
+    updates: Count = 300  # of Adam a round
+    retention: NotNegative = 0.3  # as in GradientConfig
+    retained_after: NotNegative = 2.5  # s
+
+
+@dataclasses.dataclass(frozen=True)
 class GradientConfig(Checked):
     """Hyperparameters of the ascent by the gradient through the simulator."""
 
@@ -337,11 +338,17 @@ class SACRun(Run):
 
 
 @dataclasses.dataclass(frozen=True)
-class GradientRun(Run):
-    """The gradient alone, from a policy or any other controller."""
+class SearchRun(Run):
+    """A search alone, from a policy or any other controller."""
 
     policy: str = ""  # file to start from; empty: the policy that ships with the package
     controller: str = ""  # start instead from a known one, around that policy, or module:name
+
+
+@dataclasses.dataclass(frozen=True)
+class GradientRun(SearchRun):
+    """The gradient alone."""
+
     gradient: GradientConfig = dataclasses.field(default_factory=GradientConfig)
 
     def __post_init__(self) -> None:
@@ -351,11 +358,9 @@ class GradientRun(Run):
 
 
 @dataclasses.dataclass(frozen=True)
-class SNESRun(Run):
-    """SNES alone, from a policy or any other controller."""
+class SNESRun(SearchRun):
+    """SNES alone."""
 
-    policy: str = ""  # file to start from; empty: the policy that ships with the package
-    controller: str = ""  # start instead from a known one, around that policy, or module:name
     snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
 
 
@@ -363,6 +368,7 @@ class SNESRun(Run):
 class TrainRun(SACRun):
     """SAC, then from its best policy the gradient and SNES, guarded, where they have steps."""
 
+    openings: OpeningsConfig = dataclasses.field(default_factory=OpeningsConfig)
     gradient: GradientConfig = dataclasses.field(default_factory=lambda: GradientConfig(steps=0))
     guard: GuardConfig = dataclasses.field(default_factory=GuardConfig)
     snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .config import LINES, EnvConfig, Reward
+from .config import EnvConfig, Reward
 from .plant import (
     Plant,
     forward_kinematics,
@@ -33,6 +33,7 @@ from .task import Task
 from .trigonometry import sincos
 
 __all__ = [
+    "LINES",
     "Env",
     "EnvConfig",
     "EnvState",
@@ -44,6 +45,9 @@ __all__ = [
 ]
 
 T = TypeVar("T")
+
+# The paper's heights of the end effector above which the reward asks for balance, m.
+LINES = {"acrobot": 0.375, "pendubot": 0.35}
 
 THROWN = 8192  # states of which an episode that starts after a reset draws one
 START_SPEED = 5.0  # rad/s, standard deviation of velocities of an episode that starts anywhere

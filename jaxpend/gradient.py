@@ -10,7 +10,7 @@ The first is that of ``swingup.py``. The second is there only with ``config.scen
 over a run and over imperfect scenarios (``variations.sample``, new ones every step) of
 ``1 / (1 + d^2)``, d the distance to upright in units of what the benchmark calls a success; w is
 ``config.objective.weight``. The third, with ``config.retention``, keeps what the policy does in
-scenarios in which it stands already (``retained``; Li and Hoiem, "Learning without forgetting").
+scenarios in which it stands already (``retention``).
 
 Where motion is chaotic the gradient explodes and says nothing. Therefore the window is
 ``duration`` long, the norm of each run's gradient is clipped before they are averaged, a run
@@ -37,6 +37,7 @@ from .criteria import EPSILON, ScoreV2
 from .errors import JaxpendError
 from .plant import rk4_step
 from .pytree import Pytree, pytree
+from .retention import Retained, change, check_time, retained
 from .rollout import rollout
 from .scenario import Scenario
 from .stage import Candidates, Chart, Row, SearchStage, SearchState, Stage
@@ -44,24 +45,8 @@ from .task import Task
 from .trajopt.swingup import SwingUp, smooth_score, totals
 
 __all__ = [
-    "Gradient", "GradientConfig", "GradientState", "Retained", "current", "improve", "init",
-    "retained", "slope",
+    "Gradient", "GradientConfig", "GradientState", "current", "improve", "init", "slope",
 ]  # fmt: skip
-
-SHOWN = 128  # scenarios in which the start is watched, for what is retained
-EVERY = 0.04  # s, between the times that are kept
-DRAWN = 1024  # of them that a step looks at
-# Of those scenarios: no seed of a run, of a validation or of the benchmark.
-SHOWN_SEED = 2**31 - 3
-
-
-@pytree
-class Retained(Pytree):
-    """What a policy did in random scenarios, at n times."""
-
-    obs: jax.Array  # (n, obs_size) what it saw
-    action: jax.Array  # (n,) in [-1, 1]
-    counts: jax.Array  # (n,) 1 where it ended upright, else 0
 
 
 @pytree
@@ -108,44 +93,6 @@ def robustness(
     options = {"duration": config.scenario_duration, "integrator": _fading(config.memory)}
     run = rollout(scenario, controller, key, dt=task.dt, **options)
     return uprightness(run.x).mean()
-
-
-def _check_time(config: GradientConfig, task: Task) -> None:
-    """Refuse a time from which on there is nothing to retain."""
-    if config.retained_after >= task.duration:
-        text = f"retained_after is {config.retained_after} s; it must be less than"
-        raise JaxpendError(f"{text} the {task.duration:g} s of a run")
-
-
-def retained(config: GradientConfig, policy: Policy, task: Task) -> Retained:
-    """What a policy does in scenarios of a task after ``config.retained_after`` s."""
-    key_scenarios, key_runs = jax.random.split(jax.random.key(SHOWN_SEED))
-    scenarios = jax.vmap(task.sample)(jax.random.split(key_scenarios, SHOWN))
-    first = round(config.retained_after / task.dt)
-    times = np.arange(first, round(task.duration / task.dt), max(round(EVERY / task.dt), 1))
-
-    def one(scenario, key):
-        options: dict[str, Any] = {"dt": task.dt, "duration": task.duration}
-        run = rollout(scenario, policy, key, **options)
-
-        def step(carry, now):
-            obs = policy.look(carry, *now)
-            return policy(carry, *now)[0], obs
-
-        seen = jax.lax.scan(step, policy.reset(key), (run.t[:-1], run.x_measured))[1][times]
-        return seen, jnp.broadcast_to(task.stands(run.x, scenario.plant.length), times.shape)
-
-    obs, counts = jax.vmap(one)(scenarios, jax.random.split(key_runs, SHOWN))
-    obs = obs.reshape(-1, obs.shape[-1])
-    return Retained(obs, jax.vmap(policy.greedy)(obs), counts.ravel().astype("f4"))
-
-
-def change(policy: Policy, kept: Retained, key: jax.Array) -> jax.Array:
-    """Mean squared distance () of a policy's actions to some of those that are retained."""
-    some = jax.random.randint(key, (DRAWN,), 0, len(kept.action))
-    kept = jax.tree.map(lambda leaf: leaf[some], kept)
-    off = jax.vmap(policy.greedy)(kept.obs) - kept.action
-    return jnp.sum(kept.counts * off**2) / jnp.maximum(kept.counts.sum(), 1)
 
 
 def _usable(config: GradientConfig, value, slope):
@@ -210,11 +157,8 @@ def init(
         return state
     _check_retention(controller)
     task = own_task(controller, task)
-    _check_time(config, task)
-    return state.replace(retained=_watched(config, controller, task))
-
-
-_watched = jax.jit(retained, static_argnames=("config", "task"))
+    check_time(config.retained_after, task)
+    return state.replace(retained=retained(controller, config.retained_after, task))
 
 
 def _check_retention(controller: Controller) -> None:
@@ -272,7 +216,7 @@ class Gradient(SearchStage):
             raise JaxpendError(f"{text}; this task has another score")
         if config.retention:
             _check_retention(policy)
-            _check_time(config, task)
+            check_time(config.retained_after, task)
 
     name, title, unit, column = "gradient", "Gradient", "steps", "step"
     heading, scores = "after the gradient", ("score",)
@@ -287,8 +231,10 @@ class Gradient(SearchStage):
         config = getattr(run, "gradient", None)
         if not (config and config.steps):
             return None
-        if isinstance(run, TrainRun) and run.sac.contestants > 1:
-            return Contest(config, start, task, run.sac.contestants)
+        if isinstance(run, TrainRun):
+            contestants = run.sac.contestants * (1 + run.openings.count)
+            if contestants > 1:
+                return Contest(config, start, task, contestants)
         return cls(config, start, task)
 
     def begin(self, seed: int, controller: Controller) -> SearchState:

@@ -19,7 +19,7 @@ import optax
 
 from . import devices
 from .boards import own_task
-from .config import STRATEGIES, GuardConfig, Run, SNESConfig, SNESRun
+from .config import GuardConfig, Run, SNESConfig, SNESRun
 from .controller import Controller, check_controller
 from .controllers.guard import guard
 from .controllers.policy import change_policies
@@ -31,10 +31,23 @@ from .stage import Candidates, Chart, Row, SearchStage, SearchState
 from .task import Task
 
 __all__ = [
-    "SNES", "SNESConfig", "SNESState", "best_controller", "evolve", "fitness", "init",
+    "SNES",
+    "STRATEGIES",
+    "SNESConfig",
+    "SNESState",
+    "best_controller",
+    "evolve",
+    "fitness",
+    "init",
     "mean_controller",
 ]  # fmt: skip
 
+STRATEGIES = {  # and what evosax calls them
+    "snes": "SNES",
+    "sep_cma_es": "Sep_CMA_ES",
+    "lm_ma_es": "LM_MA_ES",
+    "open_es": "Open_ES",
+}
 # Bytes of parameters that a CPU keeps near: of large networks a few at a time are faster.
 NEAR = 1.2e6
 

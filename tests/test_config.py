@@ -118,6 +118,10 @@ def test_every_text_is_free_or_one_of_a_few():
         (lambda: Observation(mean=(math.nan,) * 6), "values, each of which must be a number"),
         (lambda: Observation(clip=0.0), "clip is 0.0; it must be positive"),
         (lambda: Observation(history=-1), "history is -1; it must not be negative"),
+        (
+            lambda: Observation("angles"),
+            "history is 0; angles are seen without velocities, but for",
+        ),
         (lambda: Observation(history=10**9), "history is 1000000000; it must be at most 1,000"),
         (lambda: Observation(std=(1e-300,) * 6), "each of which must be at least 1e-09"),
         (lambda: SNESConfig(population=1), "population is 1; it must be at least 2"),
@@ -162,7 +166,14 @@ def test_values_become_pythons_own_and_hashable():
 
 # --- as mappings and in files --------------------------------------------------------------
 
-SECTIONS = ("policy", "guard", "sac", "gradient", "snes")  # that a command may have no field for
+SECTIONS = (
+    "policy",
+    "guard",
+    "sac",
+    "openings",
+    "gradient",
+    "snes",
+)  # that a command may have no field for
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,7 +10,7 @@ import pytest
 from conftest import assert_close, refused, shipped_network, task_of
 from jax.flatten_util import ravel_pytree
 
-from jaxpend import Policy, Scenario, designs, gradient
+from jaxpend import Policy, Scenario, designs, gradient, retention
 from jaxpend.config import GradientConfig, Objective
 from jaxpend.controllers import energy_shaping, guard
 from jaxpend.controllers.search_space import coordinates
@@ -146,29 +146,8 @@ def test_it_improves_the_policy_and_repeats_itself():
     np.testing.assert_array_equal(again.parameters, state.parameters)
 
 
-def test_what_a_policy_does_where_it_stands_is_retained(monkeypatch):
-    monkeypatch.setattr(gradient, "SHOWN", 12)
-    start = shipped_network()
-    config = GradientConfig(retention=1.0, retained_after=9.0, duration=0.1)
-    kept = jax.jit(gradient.retained, static_argnums=(0, 2))(config, start, TASK)
-    assert kept.obs.shape == (12 * 25, start.observation.size)
-    stands = np.asarray(kept.counts).reshape(12, 25)
-    assert (stands == stands[:, :1]).all()
-    assert 0 < stands[:, 0].sum() < 12
-    # Where it stands, cos theta1 is -1 and cos theta2 is 1.
-    up = np.asarray(kept.obs).reshape(12, 25, -1)[stands[:, 0] == 1]
-    cosines = sorted(np.abs(up[:, -1]).mean(0))[-2:]
-    np.testing.assert_allclose(cosines, 1.0, atol=0.05)
-    same = gradient.change(start, kept, KEY)
-    other = start.replace(layers=jax.tree.map(lambda leaf: 1.1 * leaf, start.layers))
-    assert same < 1e-9 < 1e-5 < gradient.change(other, kept, KEY)
-    # What fell counts nothing.
-    fell = kept.replace(action=kept.action + jnp.where(kept.counts == 0, 1.0, 0.0))
-    assert gradient.change(start, fell, KEY) < 1e-9
-
-
 def test_retention_pulls_back_to_what_the_start_did(monkeypatch):
-    monkeypatch.setattr(gradient, "SHOWN", 8)
+    monkeypatch.setattr(retention, "SHOWN", 8)
     start = shipped_network()
     config = GradientConfig(steps=30, retention=1e4, duration=0.02, learning_rate=1e-3)
     begun = gradient.init(config, start, KEY, TASK)

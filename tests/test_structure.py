@@ -27,10 +27,10 @@ robustness fleet
 trajopt
 controllers
 trajopt.search leaderboard
-stage
+stage retention
 env
 sac
-snes gradient
+snes gradient openings
 runs
 train
 report

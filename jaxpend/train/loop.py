@@ -19,6 +19,7 @@ from ..controllers.catalogue import find_controller
 from ..errors import JaxpendError
 from ..files import to_json, write_atomically
 from ..gradient import Gradient
+from ..openings import Openings
 from ..runs.folder import RunFolder, refuse_no_group, refuse_other
 from ..runs.statistics import summary
 from ..sac.stage import SAC, Imitation
@@ -33,7 +34,7 @@ __all__ = ["STAGES", "stages_of", "train"]
 
 # The stages that there are, in their order. A configuration has those for which ``Stage.of`` says
 # so; nothing else in the program knows them by name.
-STAGES: tuple[type[Stage], ...] = (Imitation, SAC, Gradient, SNES)
+STAGES: tuple[type[Stage], ...] = (Imitation, SAC, Openings, Gradient, SNES)
 
 
 def train_stage(stage: Stage, runs: Sequence[SeedRun]) -> None:
