@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .config import EnvConfig, Reward
+from .observation import Observation
 from .plant import (
     Plant,
     forward_kinematics,
@@ -137,7 +138,7 @@ class Env:
         """A state with what is seen in it; the arguments are as in ``EnvState``."""
         view, privileged = self.config.observation, action[None]
         if world is not None:
-            privileged = jnp.concatenate([view.of_state(x), privileged])
+            privileged = jnp.concatenate([self.true_view(x), privileged])
         obs = view(x if world is None else world.measured, past)
         return EnvState(x, action, past, world, obs, privileged, reward)
 
@@ -223,9 +224,16 @@ class Env:
     @property
     def mirrored(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """The factors, 1 or -1, that mirror ``obs`` (obs_size,) and ``privileged``."""
+        true = self.true_view.mirrored if self.config.randomised else ()
+        return self.config.observation.mirrored, (*true, -1)
+
+    @property
+    def true_view(self) -> Observation:
+        """How the critics see the true state: as the policy does, and always with velocities."""
         view = self.config.observation
-        true = dataclasses.replace(view, history=0).mirrored if self.config.randomised else ()
-        return view.mirrored, (*true, -1)
+        if view.kind == "angles":  # radians a period
+            return Observation(max_velocity=view.max_velocity / self.config.dt)
+        return dataclasses.replace(view, history=0)
 
 
 def truncated(config: EnvConfig, state: EnvState, steps: jax.Array) -> jax.Array:

@@ -43,6 +43,17 @@ def _clipped(x: jax.Array, max_velocity: float) -> jax.Array:
     return jnp.concatenate([seen[:4], jnp.clip(seen[4:], -1.0, 1.0)])
 
 
+def _angles(x: jax.Array, max_velocity: float) -> jax.Array:
+    """Cosine and sine of both angles, and no velocities."""
+    return _sincos(x, max_velocity)[:4]
+
+
+def _turned(now: jax.Array, before: jax.Array) -> jax.Array:
+    """Sine of how far both joints turned (2,), of cosines and sines before and after (4,)."""
+    # sin(a - b) = sin a cos b - cos a sin b: whole turns make no difference.
+    return now[2:] * before[:2] - now[:2] * before[2:]
+
+
 def _state(x: jax.Array, max_velocity: float) -> jax.Array:
     """Angles as they are, however many turns, in rad, and scaled velocities."""
     import jax.numpy as jnp
@@ -56,6 +67,7 @@ KINDS = {
     "sincos": (_sincos, (1, 1, -1, -1, -1, -1)),
     "sincos_clipped": (_clipped, (1, 1, -1, -1, -1, -1)),
     "state": (_state, (-1,) * 4),
+    "angles": (_angles, (1, 1, -1, -1)),
 }
 
 
@@ -66,12 +78,15 @@ class Observation(Checked):
     What is seen of a state (``state_size``,) is normalised to ``(seen - mean) / std``, then
     clipped to ``[-clip, clip]``; each of the three may be left out.
 
+    Of the kind ``angles`` no velocity is seen, so that its noise does not matter, but, as the
+    past, the sine of how far each joint turned in every period, over ``max_velocity``.
+
     Raises ``JaxpendError`` for an unknown kind, a velocity scale that is not positive, a
-    negative history, or a mean or std that is not of ``state_size``.
+    negative history, ``angles`` without any, or a mean or std that is not of ``state_size``.
     """
 
-    kind: Literal["wrapped", "sincos", "sincos_clipped", "state"] = "sincos"
-    max_velocity: Scale = 20.0  # rad/s, velocities are divided by it
+    kind: Literal["wrapped", "sincos", "sincos_clipped", "state", "angles"] = "sincos"
+    max_velocity: Scale = 20.0  # rad/s, velocities are divided by it; of angles rad a period
     # Past states and actions that are seen too, one control period apart.
     history: Annotated[int, Bounds(least=0, most=1000)] = 0
     mean: tuple[float, ...] | None = None  # of what is seen of a state; None: 0
@@ -80,6 +95,9 @@ class Observation(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.kind == "angles" and not self.history:
+            text = "angles are seen without velocities, but for how they change"
+            raise JaxpendError(f"history is 0; {text}; it must be at least 1")
         for name in ("mean", "std"):
             value = getattr(self, name)
             if value is not None and len(value) != self.state_size:
@@ -89,7 +107,7 @@ class Observation(Checked):
     @property
     def size(self) -> int:
         """Length of the observation."""
-        return self.state_size * (1 + self.history) + self.history
+        return len(self.mirrored)
 
     @property
     def state_size(self) -> int:
@@ -103,7 +121,8 @@ class Observation(Checked):
         They do so only where it is ``symmetric``.
         """
         signs = KINDS[self.kind][1]
-        return signs + (*signs, -1) * self.history
+        past = (-1, -1) if self.kind == "angles" else signs
+        return signs + (*past, -1) * self.history
 
     @property
     def symmetric(self) -> bool:
@@ -128,10 +147,14 @@ class Observation(Checked):
         A row of ``past`` is a state and the action in it, the newest first.
         """
         now = self.of_state(x)
-        if not self.history:
+        if past is None:
             return now
         import jax
         import jax.numpy as jnp
 
+        if self.kind == "angles":
+            seen = jax.vmap(lambda x: _angles(x, self.max_velocity))(jnp.vstack([x, past[:, :4]]))
+            turned = jax.vmap(_turned)(seen[:-1], seen[1:]) / self.max_velocity
+            return jnp.concatenate([now, jnp.column_stack([turned, past[:, 4]]).ravel()])
         before = jax.vmap(lambda row: jnp.append(self.of_state(row[:4]), row[4]))(past)
         return jnp.concatenate([now, before.ravel()])

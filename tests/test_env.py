@@ -19,7 +19,7 @@ from jaxpend.boards import v2
 from jaxpend.controllers import OpenLoop
 from jaxpend.env import Env, EnvConfig, Reward, restarted, surrogate_reward, truncated
 from jaxpend.interop.brax import DoublePendulum
-from jaxpend.observation import Observation
+from jaxpend.observation import KINDS, Observation
 from jaxpend.plant import rk4_step
 from jaxpend.rollout import rollout
 from jaxpend.scenario import Pulses
@@ -183,6 +183,32 @@ def test_history_is_what_was_measured_and_done_before_newest_first(randomised):
     assert np.abs(np.array(measured)).max() > 0.1
 
 
+@pytest.mark.parametrize("randomised", [0.0, 1.0])
+def test_angles_alone_are_seen_as_they_change_and_no_velocity_matters(randomised):
+    view = Observation("angles", max_velocity=0.1, history=2)
+    env = make("acrobot", observation=view, randomised=randomised)
+    assert view.size == 4 + 2 * 3
+    state = env.reset(jax.random.key(3))
+    measured = []
+    for action in (0.9, -0.5, 0.3):
+        measured.append(state.world.measured if randomised else state.x)
+        state = step(env, state, action)
+    measured.append(state.world.measured if randomised else state.x)
+    angles = np.array(measured, np.float64)[:, :2]
+    turned = np.sin(np.diff(angles, axis=0))[:-3:-1] / 0.1
+    seen = [np.cos(angles[-1]), np.sin(angles[-1]), [*turned[0], 0.3], [*turned[1], -0.5]]
+    assert np.abs(turned).min() > 1e-3
+    np.testing.assert_allclose(state.obs, np.concatenate(seen), atol=2e-5)
+    # Another velocity, and whole turns of everything, look the same.
+    past = state.past.at[:, 2:4].add(5.0).at[:, :2].add(2 * math.pi)
+    x = jnp.asarray(measured[-1]).at[2:].add(5.0).at[:2].add(2 * math.pi)
+    np.testing.assert_allclose(view(x, past), state.obs, atol=1e-4)
+    # The critics know the velocity of the true state, on the scale of a period of 0.01 s.
+    if randomised:
+        true = [np.cos(state.x[:2]), np.sin(state.x[:2]), state.x[2:] / 10, [0.3]]
+        np.testing.assert_allclose(state.privileged, np.concatenate(true), atol=1e-6)
+
+
 @both_robots
 def test_a_randomised_episode_is_a_rollout_in_its_scenario(robot):
     env = make(robot, randomised=1.0)
@@ -293,7 +319,7 @@ def test_keys_of_either_kind_reset_to_the_same_episode():
 NORMALISED = {"mean": (0.4, 0.8, 0, 0, 0, 0), "std": (1, 2, 3, 4, 5, 0.1), "clip": 0.5}
 
 
-@pytest.mark.parametrize("kind", ["wrapped", "sincos", "sincos_clipped", "state", "normalised"])
+@pytest.mark.parametrize("kind", [*KINDS, "normalised"])
 @pytest.mark.parametrize("randomised", [0.0, 1.0])
 def test_left_and_right_make_no_difference(kind, randomised):
     view = Observation("sincos", history=2, **NORMALISED)

@@ -367,7 +367,8 @@ def test_what_policies_may_see_and_have_is_exported(kind):
     draw = np.random.default_rng(2)
     states = draw.normal(size=(60, 4)) * np.array([5, 5, 40, 40])
     with jax.enable_x64(True):
-        found = policy(0, Observation(kind=kind)).replace(activation=activation)
+        view = Observation(kind=kind, history=2 * (kind == "angles"))
+        found = policy(0, view).replace(activation=activation)
         expected = np.asarray(again(found, np.arange(60.0), states[None])[0])
         names: dict = {}
         exec(to_numpy.source(found), names)

@@ -63,6 +63,13 @@ def test_gymnasiums_checker_has_nothing_to_say(name, windows):
     assert windows
 
 
+def test_what_angles_alone_show_is_within_its_bounds(windows):
+    view = {"kind": "angles", "max_velocity": 0.1, "history": 2}
+    env = gymnasium.make(PENDUBOT, observation=view).unwrapped
+    check_env(env)
+    np.testing.assert_allclose(env.observation_space.high, [1] * 4 + [10, 10, 1] * 2, rtol=1e-4)
+
+
 def test_stable_baselines_checker_has_nothing_to_say():
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     checker.check_env(gymnasium.make(PENDUBOT, render_mode="rgb_array").unwrapped)

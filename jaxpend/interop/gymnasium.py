@@ -76,7 +76,9 @@ def _bounds(view: Observation) -> tuple[np.ndarray, np.ndarray]:
     for side, most in ((-1, seen.min(axis=0)), (1, seen.max(axis=0))):
         # What is computed otherwise is rounded otherwise; 1 is not computed.
         most = np.where(np.abs(most) == 1, most, most + side * 1e-5 * np.abs(most))
-        rows = [most, *[np.append(most, side)] * view.history]
+        turned = np.full(2, side * (1 + 1e-5) / view.max_velocity)
+        past = turned if view.kind == "angles" else most
+        rows = [most, *[np.append(past, side)] * view.history]
         found.append(np.clip(np.concatenate(rows), -LARGEST, LARGEST).astype(np.float32))
     return found[0], found[1]
 
