@@ -25,7 +25,7 @@ from jaxpend.score import official
 
 HERE = Path(__file__).parent
 ROBOTS = ("acrobot", "pendubot")
-STAGES = ("sac", "gradient", "snes")
+STAGES = {"sac": "SAC", "openings": "openings", "gradient": "gradient", "snes": "SNES"}
 # What a recipe changes of the robot's own; "plain" and "learned" have files of their own.
 RECIPES = {
     "shipped": [],
@@ -128,23 +128,25 @@ def without(recipe: str, robot: str, seed: int, runs: Path) -> dict:
 
 def table(rows: list[dict], jobs: int) -> str:
     """A Markdown table, a row each, and the median and range of each group."""
+    shown = {n: title for n, title in STAGES.items() if any(n in r for r in rows)}
+    heads = ["recipe", "robot", "seed", "imitation", *(f"then {t}" for t in shown.values())]
+    heads += ["robustness", "unguarded", *shown.values()]
     lines = [
         f"Machine: {platform.machine()}, {os.cpu_count()} cores; single-threaded runs, {jobs} at "
         "once; robustness: median (range) over 5 benchmark keys, and that of the network without "
         "its guard.",
         "",
-        "| recipe | robot | seed | imitation | then SAC | then gradient | then SNES | robustness "
-        "| unguarded | SAC | gradient | SNES |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "| " + " | ".join(heads) + " |",
+        "|" + "---|" * len(heads),
     ]
     for r in rows:
         overall = r["robustness"]
         cells = [r["recipe"], r["robot"], r["seed"]]
         cells += ["" if r["imitation"] is None else f"{r['imitation']:.4f}"]
-        cells += [f"{r[n]['score']:.4f}" if n in r else "" for n in STAGES]
+        cells += [f"{r[n]['score']:.4f}" if n in r else "" for n in shown]
         cells += ["{median:.3f} ({lowest:.3f} to {highest:.3f})".format(**overall)]
         cells += [f"{overall['network']:.3f}" if "network" in overall else ""]
-        cells += [f"{r[n]['seconds']:.0f} s" if n in r else "" for n in STAGES]
+        cells += [f"{r[n]['seconds']:.0f} s" if n in r else "" for n in shown]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     lines += [
         "",

@@ -43,7 +43,7 @@ PositiveOrInfinite = Annotated[float, Bounds(above=0, infinite=True)]
 class Reward(Checked):
     """Coefficients of the surrogate reward; see jaxpend.env.surrogate_reward."""
 
-    line: float | None = None  # m, height that separates the regimes; None: ``env.LINES``
+    line: float | None = None  # m, height that separates the regimes; None: the paper's
     alpha: NotNegative = 2.0  # J, straight elbow above the line
     beta: NotNegative = 1.0  # kinetic energy above the line
     rho1: NotNegative = 0.1  # action squared, above the line
@@ -236,12 +236,13 @@ class CheckpointConfig(Checked):
 class OpeningsConfig(Checked):
     """How other ways to begin are tried and learned; see ``jaxpend.openings``."""
 
-    count: Natural = 0  # openings that a policy learns; 0: ``train`` leaves the stage out
-    longest: Duration = 1.2  # s
-    rounds: Count = 12  # of watching and imitating
+    # How many openings each policy learns; 0: ``train`` leaves the stage out.
+    count: Annotated[int, Bounds(least=0, most=100)] = 0
+    longest: Duration = 1.2  # s, of an opening
+    rounds: Count = 12  # of imitating, each on new runs of the policy
     updates: Count = 300  # of Adam a round
-    retention: NotNegative = 0.3  # as in GradientConfig
-    retained_after: NotNegative = 2.5  # s
+    retention: NotNegative = 0.3  # weight of the distance to what it did where it stands
+    retained_after: NotNegative = 2.5  # s into a run, from when on that counts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -307,8 +308,8 @@ class Run(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.seed + self.seeds > LARGEST:
-            text = f"seeds is {self.seeds}; from seed {self.seed} on there are not so many"
-            raise JaxpendError(text)
+            there = f"from seed {self.seed} on there are not so many"
+            raise JaxpendError(f"seeds is {self.seeds}; {there}")
         if self.plant and self.design:
             raise JaxpendError("plant and design are both given; a run has one of them")
 
@@ -366,7 +367,7 @@ class SNESRun(SearchRun):
 
 @dataclasses.dataclass(frozen=True)
 class TrainRun(SACRun):
-    """SAC, then from its best policy the gradient and SNES, guarded, where they have steps."""
+    """SAC; from its best policies openings, the gradient, and SNES, guarded, where they are on."""
 
     openings: OpeningsConfig = dataclasses.field(default_factory=OpeningsConfig)
     gradient: GradientConfig = dataclasses.field(default_factory=lambda: GradientConfig(steps=0))
@@ -376,9 +377,8 @@ class TrainRun(SACRun):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.snes.generations and (self.guard.observe or self.guard.rescue):
-            raise JaxpendError(
-                "snes.generations is 0; a guard needs some, since SNES begins with it"
-            )
+            text = "a guard needs some, since SNES begins with it"
+            raise JaxpendError(f"snes.generations is 0; {text}")
 
 
 @dataclasses.dataclass(frozen=True)

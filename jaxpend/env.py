@@ -137,7 +137,7 @@ class Env:
     def observe(self, x, action, past, world, reward) -> EnvState:
         """A state with what is seen in it; the arguments are as in ``EnvState``."""
         view, privileged = self.config.observation, action[None]
-        if world is not None:
+        if self.shows_true_state:
             privileged = jnp.concatenate([self.true_view(x), privileged])
         obs = view(x if world is None else world.measured, past)
         return EnvState(x, action, past, world, obs, privileged, reward)
@@ -224,15 +224,20 @@ class Env:
     @property
     def mirrored(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """The factors, 1 or -1, that mirror ``obs`` (obs_size,) and ``privileged``."""
-        true = self.true_view.mirrored if self.config.randomised else ()
+        true = self.true_view.mirrored if self.shows_true_state else ()
         return self.config.observation.mirrored, (*true, -1)
+
+    @property
+    def shows_true_state(self) -> bool:
+        """Whether the critics see the true state: where the policy does not."""
+        return bool(self.config.randomised) or self.config.observation.kind == "angles"
 
     @property
     def true_view(self) -> Observation:
         """How the critics see the true state: as the policy does, and always with velocities."""
         view = self.config.observation
-        if view.kind == "angles":  # radians a period
-            return Observation(max_velocity=view.max_velocity / self.config.dt)
+        if view.kind == "angles":
+            return Observation(max_velocity=view.max_velocity)
         return dataclasses.replace(view, history=0)
 
 

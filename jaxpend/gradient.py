@@ -157,7 +157,7 @@ def init(
         return state
     _check_retention(controller)
     task = own_task(controller, task)
-    check_time(config.retained_after, task)
+    check_time(config.retained_after, task, "gradient")
     return state.replace(retained=retained(controller, config.retained_after, task))
 
 
@@ -216,7 +216,7 @@ class Gradient(SearchStage):
             raise JaxpendError(f"{text}; this task has another score")
         if config.retention:
             _check_retention(policy)
-            check_time(config.retained_after, task)
+            check_time(config.retained_after, task, "gradient")
 
     name, title, unit, column = "gradient", "Gradient", "steps", "step"
     heading, scores = "after the gradient", ("score",)

@@ -79,25 +79,31 @@ class Observation(Checked):
     clipped to ``[-clip, clip]``; each of the three may be left out.
 
     Of the kind ``angles`` no velocity is seen, so that its noise does not matter, but, as the
-    past, the sine of how far each joint turned in every period, over ``max_velocity``.
+    past, the sine of how far each joint turned in every period, over ``max_turn``: that tells
+    speeds apart up to pi/2 a period. It is not normalised.
 
-    Raises ``JaxpendError`` for an unknown kind, a velocity scale that is not positive, a
-    negative history, ``angles`` without any, or a mean or std that is not of ``state_size``.
+    Raises ``JaxpendError`` for an unknown kind, a scale that is not positive, a negative history,
+    ``angles`` without any or normalised, or a mean or std that is not of ``state_size``.
     """
 
     kind: Literal["wrapped", "sincos", "sincos_clipped", "state", "angles"] = "sincos"
-    max_velocity: Scale = 20.0  # rad/s, velocities are divided by it; of angles rad a period
+    max_velocity: Scale = 20.0  # rad/s, velocities are divided by it
     # Past states and actions that are seen too, one control period apart.
     history: Annotated[int, Bounds(least=0, most=1000)] = 0
     mean: tuple[float, ...] | None = None  # of what is seen of a state; None: 0
     std: tuple[Scale, ...] | None = None  # standard deviations; None: 1
     clip: Positive | None = None  # largest magnitude of what is seen, once normalised; None: any
+    max_turn: Scale = 0.1  # rad in a period, what ``angles`` sees of the past is divided by it
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.kind == "angles" and not self.history:
             text = "angles are seen without velocities, but for how they change"
             raise JaxpendError(f"history is 0; {text}; it must be at least 1")
+        for name in ("mean", "std", "clip"):
+            if self.kind == "angles" and (value := getattr(self, name)) is not None:
+                text = "angles are not normalised; leave it out"
+                raise JaxpendError(f"{name} is {value}; {text}")
         for name in ("mean", "std"):
             value = getattr(self, name)
             if value is not None and len(value) != self.state_size:
@@ -154,7 +160,7 @@ class Observation(Checked):
 
         if self.kind == "angles":
             seen = jax.vmap(lambda x: _angles(x, self.max_velocity))(jnp.vstack([x, past[:, :4]]))
-            turned = jax.vmap(_turned)(seen[:-1], seen[1:]) / self.max_velocity
+            turned = jax.vmap(_turned)(seen[:-1], seen[1:]) / self.max_turn
             return jnp.concatenate([now, jnp.column_stack([turned, past[:, 4]]).ravel()])
         before = jax.vmap(lambda row: jnp.append(self.of_state(row[:4]), row[4]))(past)
         return jnp.concatenate([now, before.ravel()])

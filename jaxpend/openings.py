@@ -5,8 +5,9 @@ gradient. But a policy that swings up from anywhere need not begin as it does: a
 torque for the first moments it goes on by itself, and swings up in another way. ``explore`` tries
 a grid of such openings in the nominal run, ``chosen`` takes the best of those that differ, and
 ``learn`` makes one the policy's habit: it imitates itself with the opening, on what it sees when
-it tries to (Ross, Gordon and Bagnell, "A reduction of imitation learning and structured prediction
-to no-regret online learning", 2011), and keeps what it does where it stands (``retention``).
+it tries to (DAgger: Ross, Gordon and Bagnell, "A reduction of imitation learning and structured
+prediction to no-regret online learning", 2011), and keeps what it does where it stands
+(``retention``).
 """
 
 from functools import partial
@@ -16,7 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.flatten_util import ravel_pytree
 
+from . import devices
 from .config import Objective, OpeningsConfig, Run, TrainRun
 from .controller import Controller
 from .controllers.policy import Policy
@@ -48,7 +51,7 @@ LEARNING_RATE = 1e-3
 
 @pytree
 class Opened(Pytree):
-    """A policy that begins with a constant torque, and remembers that it did."""
+    """A policy, without noise, that begins with a constant torque and remembers that it did."""
 
     policy: Policy
     share: jax.Array  # () of the torque limit, in [-1, 1]
@@ -95,15 +98,16 @@ def explore(config: OpeningsConfig, policy: Policy, task: Task) -> tuple[Criteri
         return performance(Opened(policy, share, until), task.plant, key, task)
 
     own = performance(policy, task.plant, key, task).tau_smoothness
-    c = jax.vmap(run)(*map(jnp.asarray, grid(config)))
+    c = devices.split(jax.vmap(run))(*map(jnp.asarray, grid(config)))
     return c, task.score(c.replace(tau_smoothness=jnp.broadcast_to(own, c.energy.shape)))
 
 
 def chosen(times: np.ndarray, scores: np.ndarray, own: float, count: int) -> list[int]:
-    """Which openings are learned, the best first, at most so many.
+    """The numbers of the openings that are learned, the best first, at most so many.
 
-    ``times`` (n,), s, and ``scores`` (n,) are those of their swing-ups, ``own`` that of the
-    policy's; all swing up, at times that differ.
+    ``times`` (n,), s, and ``scores`` (n,) are those of their swing-ups, ``own`` the time of the
+    policy's. Those without a score are left out, and those that swing up at the time of the
+    policy or of a better one.
     """
     taken, found = [own], list[int]()
     for i in map(int, np.argsort(-scores, kind="stable")):
@@ -117,7 +121,7 @@ def chosen(times: np.ndarray, scores: np.ndarray, own: float, count: int) -> lis
 
 @partial(jax.jit, static_argnames=("config", "task"))
 def learn(config: OpeningsConfig, opened: Opened, task: Task, key: jax.Array) -> Policy:
-    """The policy that begins as with an opening, without it; ``key`` is consumed."""
+    """A policy that does by itself what ``opened`` does; ``key`` is consumed."""
     start, every = opened.policy, max(round(EVERY / task.dt), 1)
     kept = retained(start, config.retained_after, task)
     driven = np.eye(2)[task.joint]
@@ -142,8 +146,8 @@ def learn(config: OpeningsConfig, opened: Opened, task: Task, key: jax.Array) ->
 
     adam = optax.adam(LEARNING_RATE)
 
-    def imitate(carry, now):
-        number, key = now
+    def imitate(carry, turn):
+        number, key = turn
         layers, memory, shown = carry
         rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), shown)
 
@@ -158,8 +162,8 @@ def learn(config: OpeningsConfig, opened: Opened, task: Task, key: jax.Array) ->
         key_updates, key_runs = jax.random.split(key)
         keys = jax.random.split(key_updates, config.updates)
         (layers, memory), _ = jax.lax.scan(update, (layers, memory), keys)
-        now = watched(start.replace(layers=layers), key_runs)
-        shown = jax.tree.map(lambda old, new: old.at[number].set(new), shown, now)
+        latest = watched(start.replace(layers=layers), key_runs)
+        shown = jax.tree.map(lambda old, new: old.at[number].set(new), shown, latest)
         return (layers, memory, shown), None
 
     key_first, key = jax.random.split(key)
@@ -174,7 +178,7 @@ def learn(config: OpeningsConfig, opened: Opened, task: Task, key: jax.Array) ->
 
 @pytree
 class OpeningsState(Pytree):
-    """Policies, and what they have learned; those that are not learned yet are their copies."""
+    """Policies and what they have learned; where that is nothing yet, one that does nothing."""
 
     policies: tuple[Policy, ...]  # with what each has learned behind it
     worths: jax.Array  # (policies,) what they are compared by; -inf before they are judged
@@ -195,12 +199,15 @@ class Openings(Stage[Any, OpeningsState, tuple[Controller, ...]]):
         """``policy`` is of the structure of the ``total`` ones that try.
 
         Raises ``JaxpendError`` for a task without a v2 score of the nominal plant, or whose runs
-        are over before anything is retained.
+        are over before an opening is, or before anything is retained.
         """
         if task.chance or not isinstance(task.scoring, ScoreV2):
-            text = "openings are compared by the v2 score of the nominal plant"
-            raise JaxpendError(f"{text}; this task has another score")
-        check_time(config.retained_after, task)
+            text = "openings are compared by the v2 score of the nominal plant, and this task has"
+            raise JaxpendError(f"{text} another; set openings.count to 0")
+        if (most := task.duration - AFTER) < config.longest:
+            text = f"openings.longest is {config.longest} s; it must be at most {most:g} s"
+            raise JaxpendError(f"{text}, {AFTER} s less than a run")
+        check_time(config.retained_after, task, "openings")
         self.config, self.objective, self.policy, self.task = config, objective, policy, task
         self.total = total
 
@@ -212,7 +219,8 @@ class Openings(Stage[Any, OpeningsState, tuple[Controller, ...]]):
 
     def start(self, seed: int, before: Any) -> OpeningsState:
         before = before if isinstance(before, tuple) else (before,)
-        each = tuple(policy for policy in before for _ in range(1 + self.config.count))
+        nothing = before[0].replace(layers=jax.tree.map(jnp.zeros_like, before[0].layers))
+        each = tuple(p for policy in before for p in (policy, *[nothing] * self.config.count))
         key = jax.random.fold_in(jax.random.key(seed), 4)
         return OpeningsState(each, jnp.full(len(each), -jnp.inf), jnp.asarray(0), key)
 
@@ -236,24 +244,31 @@ class Openings(Stage[Any, OpeningsState, tuple[Controller, ...]]):
     def _tried(self, state: OpeningsState) -> tuple[OpeningsState, Row]:
         """One policy more has tried and learned."""
         first = self.done(state) * (1 + self.config.count)
-        policies, worths, policy = list(state.policies), np.array(state.worths), None
-        policy = policies[first]
+        policies, worths = list(state.policies), np.array(state.worths)
+        policy, key = policies[first], jax.random.fold_in(state.key, 0)
         score, worths[first] = self.compared(policy)
-        c, scores = explore(self.config, policy, self.task)
+        c, scores = devices.compute(partial(explore, self.config, task=self.task), policy)
         own, times = float(nominal(policy, self.task).swingup_time), np.asarray(c.swingup_time)
         found = chosen(times, np.asarray(scores), own, self.config.count)
-        row: Row = {"before": score, "score": score, "found": 0.0, "learned": len(found)}
+        row: Row = {"before": score, "learned": 0}
         for place, i in enumerate(found, first + 1):
             share, until = (values[i] for values in grid(self.config))
             opened = Opened(policy, jnp.asarray(share), jnp.asarray(until))
-            key = jax.random.fold_in(state.key, place)
-            policies[place] = learn(self.config, opened, self.task, key)
-            after, worths[place] = self.compared(policies[place])
-            if after > row["score"] or place == first + 1:
-                row |= {"score": after, "found": float(scores[i]), "share": share, "until": until}
+            learned = self.learned(opened, jax.random.fold_in(key, place))
+            if not np.isfinite(ravel_pytree(learned.layers)[0]).all():
+                continue  # it diverged
+            policies[place], row["learned"] = learned, row["learned"] + 1
+            after, worths[place] = self.compared(learned)
+            if after > row.get("score", -1.0):
+                row |= {"score": after, "found": float(scores[i])}
+                row |= {"share": float(share), "until": float(until)}
         return state.replace(
             policies=tuple(policies), worths=jnp.asarray(worths), done=state.done + 1
         ), row
+
+    def learned(self, opened: Opened, key: jax.Array) -> Policy:
+        """``learn``, the same on all hosts."""
+        return devices.compute(lambda o, k: learn(self.config, o, self.task, k), opened, key)
 
     def judge(self, state: OpeningsState, metrics: Row) -> tuple[Row, Candidates]:
         if not metrics:
@@ -274,7 +289,7 @@ class Openings(Stage[Any, OpeningsState, tuple[Controller, ...]]):
         return state.policies
 
     def rekey(self, state: OpeningsState, number: int) -> OpeningsState:
-        return state.replace(key=jax.random.fold_in(state.key, number))
+        return state.replace(key=jax.random.fold_in(jax.random.fold_in(state.key, 1), number))
 
     def outcome(self, state: OpeningsState, best: Controller) -> tuple[Controller, ...]:
         """All of them, the best first."""

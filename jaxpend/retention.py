@@ -36,23 +36,25 @@ class Retained(Pytree):
     counts: jax.Array  # (n,) 1 where it ended upright, else 0
 
 
-def check_time(after: float, task: Task) -> None:
-    """Refuse a time, s, from which on there is nothing to retain."""
+def check_time(after: float, task: Task, section: str) -> None:
+    """Refuse a time, s, of a section of the configuration, after which nothing can be retained."""
     if after >= task.duration:
-        text = f"retained_after is {after} s; it must be less than the {task.duration:g} s of a run"
-        raise JaxpendError(text)
+        text = f"{section}.retained_after is {after} s; it must be less than"
+        raise JaxpendError(f"{text} the {task.duration:g} s of a run")
 
 
 def seen(policy: Any, run: Trajectory, key: jax.Array) -> jax.Array:
-    """What a policy saw at all steps of its run, (N, obs_size); ``key`` is that of its reset.
+    """What a policy saw at all steps of its run, (N, obs_size); ``key`` is that of ``rollout``.
 
-    So does any controller that, like a policy, can ``look``.
+    Of any other controller that can ``look``, too.
     """
 
     def step(carry, now):
         return policy(carry, *now)[0], policy.look(carry, *now)
 
-    return jax.lax.scan(step, policy.reset(key), (run.t[:-1], run.x_measured))[1]
+    return jax.lax.scan(step, policy.reset(jax.random.split(key)[1]), (run.t[:-1], run.x_measured))[
+        1
+    ]
 
 
 @partial(jax.jit, static_argnames=("after", "task"))

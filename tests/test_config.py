@@ -122,6 +122,7 @@ def test_every_text_is_free_or_one_of_a_few():
             lambda: Observation("angles"),
             "history is 0; angles are seen without velocities, but for",
         ),
+        (lambda: Observation("angles", history=1, clip=0.5), "clip is 0.5; angles are not normali"),
         (lambda: Observation(history=10**9), "history is 1000000000; it must be at most 1,000"),
         (lambda: Observation(std=(1e-300,) * 6), "each of which must be at least 1e-09"),
         (lambda: SNESConfig(population=1), "population is 1; it must be at least 2"),

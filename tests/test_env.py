@@ -185,7 +185,7 @@ def test_history_is_what_was_measured_and_done_before_newest_first(randomised):
 
 @pytest.mark.parametrize("randomised", [0.0, 1.0])
 def test_angles_alone_are_seen_as_they_change_and_no_velocity_matters(randomised):
-    view = Observation("angles", max_velocity=0.1, history=2)
+    view = Observation("angles", max_velocity=10.0, max_turn=0.1, history=2)
     env = make("acrobot", observation=view, randomised=randomised)
     assert view.size == 4 + 2 * 3
     state = env.reset(jax.random.key(3))
@@ -203,10 +203,9 @@ def test_angles_alone_are_seen_as_they_change_and_no_velocity_matters(randomised
     past = state.past.at[:, 2:4].add(5.0).at[:, :2].add(2 * math.pi)
     x = jnp.asarray(measured[-1]).at[2:].add(5.0).at[:2].add(2 * math.pi)
     np.testing.assert_allclose(view(x, past), state.obs, atol=1e-4)
-    # The critics know the velocity of the true state, on the scale of a period of 0.01 s.
-    if randomised:
-        true = [np.cos(state.x[:2]), np.sin(state.x[:2]), state.x[2:] / 10, [0.3]]
-        np.testing.assert_allclose(state.privileged, np.concatenate(true), atol=1e-6)
+    # The critics know the velocity, with or without a scenario.
+    true = [np.cos(state.x[:2]), np.sin(state.x[:2]), state.x[2:] / 10, [0.3]]
+    np.testing.assert_allclose(state.privileged, np.concatenate(true), atol=1e-6)
 
 
 @both_robots

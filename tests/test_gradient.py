@@ -165,7 +165,7 @@ def test_retention_is_of_a_policy_alone():
     with refused("it needs a policy without a guard, and not Guarded"):
         gradient.Gradient(config, guard(shipped_network(), "pendubot"), TASK)
     late = dataclasses.replace(config, retained_after=10.0)
-    with refused("retained_after is 10.0 s; it must be less than the 10 s of a run"):
+    with refused("gradient.retained_after is 10.0 s; it must be less than the 10 s of a run"):
         gradient.Gradient(late, shipped_network(), TASK)
 
 

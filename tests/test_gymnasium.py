@@ -64,10 +64,12 @@ def test_gymnasiums_checker_has_nothing_to_say(name, windows):
 
 
 def test_what_angles_alone_show_is_within_its_bounds(windows):
-    view = {"kind": "angles", "max_velocity": 0.1, "history": 2}
+    view = {"kind": "angles", "max_turn": 0.1, "history": 2}
     env = gymnasium.make(PENDUBOT, observation=view).unwrapped
     check_env(env)
-    np.testing.assert_allclose(env.observation_space.high, [1] * 4 + [10, 10, 1] * 2, rtol=1e-4)
+    most = [1] * 4 + [10, 10, 1] * 2
+    np.testing.assert_allclose(env.observation_space.high, most, rtol=1e-4)
+    np.testing.assert_allclose(env.observation_space.low, -np.array(most), rtol=1e-4)
 
 
 def test_stable_baselines_checker_has_nothing_to_say():

@@ -1,12 +1,14 @@
 """Openings: other ways to begin a swing-up, tried and learned; and what is retained meanwhile."""
 
 import dataclasses
+import signal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import assert_close, refused, shipped_network, task_of
+from training_runs import arrays_of, result_of, rows_of
 
 from jaxpend import openings, retention
 from jaxpend.boards import task_of as any_task
@@ -24,11 +26,21 @@ from jaxpend.retention import change, retained
 from jaxpend.rollout import rollout
 from jaxpend.scenario import Scenario
 from jaxpend.score import nominal
-from jaxpend.train.loop import stages_of
+from jaxpend.train.interrupt import Stopped
+from jaxpend.train.loop import stages_of, train
+from jaxpend.train.seed_run import all_finite
 
 KEY = jax.random.key(0)
 TASK = task_of("pendubot")
 SMALL = OpeningsConfig(count=1, longest=0.1, rounds=1, updates=1, retained_after=9.0)
+
+
+@pytest.fixture(autouse=True)
+def compiled_anew(monkeypatch):
+    """What was compiled with other constants is not used again."""
+    yield
+    for function in (retained, explore, learn):
+        function.clear_cache()
 
 
 def remembering():
@@ -133,17 +145,18 @@ def test_all_that_tried_go_on_and_what_they_learned_beside_them(monkeypatch):
     def bias(policy):
         return round(float(policy.layers[-1][1][0] - shipped_network().layers[-1][1][0]), 3)
 
-    def learned(config, opened, task, key):
+    def learned(self, opened, key):
         *hidden, (kernel, last) = opened.policy.layers
         return opened.policy.replace(layers=(*hidden, (kernel, last + 1)))
 
-    monkeypatch.setattr(openings, "learn", learned)
+    monkeypatch.setattr(Openings, "learned", learned)
     monkeypatch.setattr(Openings, "compared", lambda self, policy: (0.1, bias(policy)))
     ways = iter([[3], [], [5]])
     monkeypatch.setattr(openings, "chosen", lambda *rest: next(ways))
     criteria = nominal(shipped_network(), TASK)
     every = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (480,)), criteria)
-    monkeypatch.setattr(openings, "explore", lambda *rest: (every, jnp.linspace(0, 0.9, 480)))
+    scores = jnp.linspace(0, 0.9, 480)
+    monkeypatch.setattr(openings, "explore", lambda *rest, task: (every, scores))
     run = TrainRun(openings=SMALL, sac=SACConfig(contestants=3), snes=SNESConfig(generations=0))
     run = dataclasses.replace(run, gradient=GradientConfig(steps=8))
     stage = Openings.of(run, shipped_network(), TASK)
@@ -158,9 +171,9 @@ def test_all_that_tried_go_on_and_what_they_learned_beside_them(monkeypatch):
         best = round(candidates[0][1], 3)
         said.append((stage.done(state), row["learned"], best, len(candidates)))
     assert said == [(1, 1, 1.3, 2), (2, 0, 1.3, 3), (3, 1, 1.3, 5)]
-    after = stage.outcome(state, None)
-    # The copy of the one that found nothing is last.
-    assert [bias(policy) for policy in after] == [1.3, 1.1, 0.3, 0.2, 0.1, 0.2]
+    *after, nothing = stage.outcome(state, None)
+    assert [bias(policy) for policy in after] == [1.3, 1.1, 0.3, 0.2, 0.1]
+    assert not any(leaf.any() for leaf in jax.tree.leaves(nothing.layers))
     contest = Gradient.of(run, shipped_network(), TASK)
     assert (type(contest), contest.contestants) == (Contest, 6)
 
@@ -171,20 +184,69 @@ def test_the_stage_is_there_where_something_is_learned():
     assert list(stages_of(TrainRun(snes=SNESConfig(generations=0)), None, TASK)) == ["sac"]
 
 
-def test_one_policy_tries_and_learns():
+def test_one_policy_tries_and_learns(monkeypatch):
+    monkeypatch.setattr(openings, "APART", 0.001)  # another time, however near, is another way
     stage = Openings(SMALL, Objective(), shipped_network(), TASK, 1)
     state = stage.start(0, shipped_network())  # of SAC without contestants
-    assert jax.tree.structure(stage.like()) == jax.tree.structure(state)
+
+    def forms(tree):
+        return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
+
+    assert forms(stage.like()) == forms(state)
     [(after, row)] = stage.advance([state])
-    assert stage.done(after) == 1
-    assert 0 <= row["learned"] <= 1
-    assert "score 0.69" in stage.note(row)
+    assert (stage.done(after), row["learned"]) == (1, 1)
+    assert abs(row["share"]) in np.abs(openings.SHARES)
+    assert np.isfinite(after.worths).all()
+    assert stage.note(row).startswith("score 0.69")
     again = stage.advance([state])[0][0]
-    chex_equal(after.policies, again.policies)
+    jax.tree.map(np.testing.assert_array_equal, after.policies, again.policies)
+    # With another key it learns from other runs.
+    other = stage.advance([stage.rekey(state, 1)])[0][0]
+    assert not np.array_equal(other.policies[1].layers[0][0], after.policies[1].layers[0][0])
 
 
-def chex_equal(one, other):
-    jax.tree.map(np.testing.assert_array_equal, one, other)
+def test_what_diverged_is_not_learned(monkeypatch):
+    monkeypatch.setattr(openings, "APART", 0.001)
+    spoilt = shipped_network(bias=np.nan)
+    monkeypatch.setattr(Openings, "learned", lambda *rest: spoilt)
+    stage = Openings(SMALL, Objective(), shipped_network(), TASK, 1)
+    [(state, row)] = stage.advance([stage.start(0, shipped_network())])
+    assert row["learned"] == 0
+    assert stage.note(row).endswith("no other way found")
+    assert all_finite(stage.watched(state))
+
+
+def test_a_run_that_is_stopped_between_two_policies_ends_as_one_that_is_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(openings, "APART", 0.001)
+    sac = SACConfig(
+        steps=8, num_envs=4, contestants=2, eval_every=4, replay_capacity=64, actor_hidden=(4,),
+        critic_hidden=(4,),
+    )  # fmt: skip
+    run = TrainRun(sac=sac, openings=SMALL, snes=SNESConfig(generations=0), runs=str(tmp_path))
+    shipped = shipped_network()
+    monkeypatch.setattr("jaxpend.sac.algorithm.greedy_policy", lambda *rest: shipped)
+    whole = train(dataclasses.replace(run, run="whole"))
+    looks = iter([None, None, None, Stopped(signal.SIGINT)])
+
+    def look(agreed):
+        if (now := next(looks, None)) is not None:
+            raise now
+
+    monkeypatch.setattr("jaxpend.train.loop.stop_if_asked", look)
+    halves = dataclasses.replace(run, run="halves")
+    with pytest.raises(Stopped, match="stopped in Openings at 1 of 2 policies"):
+        train(halves)
+    train(halves)
+    assert result_of(tmp_path / "halves") == result_of(tmp_path / "whole")
+    assert rows_of(tmp_path / "halves") == rows_of(tmp_path / "whole")
+    rows = rows_of(tmp_path / "whole", "openings")
+    assert [row["policies"] for row in rows] == [0, 1, 2]
+    assert [row.get("learned") for row in rows] == [None, 1, 1]
+    assert whole["score"] == whole["openings"]["score"] > 0.6
+    one, other = (arrays_of(tmp_path / name / "policy.npz") for name in ("whole", "halves"))
+    assert one.keys() == other.keys()
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name])
 
 
 def test_openings_are_of_runs_that_a_v2_score_judges():
@@ -192,5 +254,10 @@ def test_openings_are_of_runs_that_a_v2_score_judges():
     with refused("openings are compared by the v2 score of the nominal plant"):
         Openings(SMALL, Objective(), shipped_network(), thrown, 1)
     late = dataclasses.replace(SMALL, retained_after=10.0)
-    with refused("retained_after is 10.0 s; it must be less than the 10 s of a run"):
+    with refused("openings.retained_after is 10.0 s; it must be less than the 10 s of a run"):
         Openings(late, Objective(), shipped_network(), TASK, 1)
+    long = dataclasses.replace(SMALL, longest=9.5)
+    with refused("openings.longest is 9.5 s; it must be at most 9.4 s, 0.6 s less than a run"):
+        Openings(long, Objective(), shipped_network(), TASK, 1)
+    with refused("count is 101; it must be at most 100", start=""):
+        OpeningsConfig(count=101)

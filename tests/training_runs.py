@@ -55,7 +55,7 @@ def rows_of(folder, stage=None):
 def result_of(folder):
     """The result, without the time."""
     result = json.loads((folder / "result.json").read_text())
-    for stage in {"sac", "gradient", "snes"} & result.keys():
+    for stage in {"sac", "openings", "gradient", "snes"} & result.keys():
         del result[stage]["seconds"]
     return result
 

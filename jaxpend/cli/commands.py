@@ -25,8 +25,8 @@ from .output import ARRAYS, JSON, MARKDOWN, check_file, check_folder, emit, emit
 def train(config: TrainRun, command: str) -> None:
     """Imitation, SAC and SNES by a recipe; ends with the official score.
 
-    Imitation comes where the configuration has demonstrations, the gradient, between SAC and SNES,
-    where it has steps.
+    Imitation comes where the configuration has demonstrations; between SAC and SNES come other
+    ways to begin, where it has a count of openings, and the gradient, where it has steps.
     """
     execute(config, command)
 

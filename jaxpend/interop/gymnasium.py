@@ -65,8 +65,8 @@ def _environment(robot: str, plant: str, design: str, fields: dict[str, Any]) ->
 def _bounds(view: Observation) -> tuple[np.ndarray, np.ndarray]:
     """The least and the most (obs_size,) of what can be seen, float32.
 
-    Every kind sees angles and velocities one by one, so that they are found among states with
-    extreme ones; what has no bound gets the largest number.
+    Every kind sees a state's angles and velocities one by one, so that they are found among states
+    with extreme ones; what has no bound gets the largest number.
     """
     turns = np.array([-LARGEST, -1e-9, 0, np.pi / 2, np.pi, 3 * np.pi / 2, LARGEST], np.float32)
     speeds = np.array([-LARGEST, 0, LARGEST], np.float32)
@@ -76,7 +76,7 @@ def _bounds(view: Observation) -> tuple[np.ndarray, np.ndarray]:
     for side, most in ((-1, seen.min(axis=0)), (1, seen.max(axis=0))):
         # What is computed otherwise is rounded otherwise; 1 is not computed.
         most = np.where(np.abs(most) == 1, most, most + side * 1e-5 * np.abs(most))
-        turned = np.full(2, side * (1 + 1e-5) / view.max_velocity)
+        turned = np.full(2, side * (1 + 1e-5) / view.max_turn)
         past = turned if view.kind == "angles" else most
         rows = [most, *[np.append(past, side)] * view.history]
         found.append(np.clip(np.concatenate(rows), -LARGEST, LARGEST).astype(np.float32))

@@ -1,4 +1,4 @@
-"""The whole job: SAC on the surrogate reward, then the gradient and SNES on the official score."""
+"""The whole job: SAC on a surrogate reward, then the searches on the official score."""
 
 import contextlib
 import dataclasses
@@ -13,7 +13,7 @@ import numpy as np
 
 from .. import devices, hosts
 from ..boards import named_board, task_of
-from ..config import GradientRun, Run, SNESRun
+from ..config import Run, SearchRun
 from ..controller import Controller
 from ..controllers.catalogue import find_controller
 from ..errors import JaxpendError
@@ -145,7 +145,7 @@ def _train(config: Run, command: str, kinds: Sequence[type[Stage]]) -> dict[str,
     """What ``train`` does on one host, on all alike."""
     names = (config.robot, config.plant, config.design, config.board, config.preset)
     task, start = task_of(*names), None
-    if isinstance(config, GradientRun | SNESRun):
+    if isinstance(config, SearchRun):
         # Before the folder is made: a wrong file leaves nothing behind.
         start = find_controller(config.policy, config.controller, task)
     board = dataclasses.replace(named_board(config.robot, config.board), task=task)
