@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .config import EnvConfig, Reward
+from .errors import JaxpendError
 from .observation import Observation
 from .plant import (
     Plant,
@@ -118,10 +119,18 @@ class Env:
 
     ``reset`` and ``step`` are pure and of one environment; ``jax.vmap`` them. Episodes never
     terminate: count steps, and ask ``truncated``.
+
+    Raises ``JaxpendError`` for a policy that is to see angles alone on a task in which the arm is
+    thrown by hand: how they change then says nothing of the velocities.
     """
 
     config: EnvConfig
     task: Task
+
+    def __post_init__(self) -> None:
+        if self.task.resets and self.config.observation.kind == "angles":
+            text = "where the arm is thrown by hand a policy must see velocities: sincos, for one"
+            raise JaxpendError(f"observation.kind is angles; {text}")
 
     @property
     def plant(self) -> Plant:

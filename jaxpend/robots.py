@@ -9,8 +9,9 @@ __all__ = ["ROBOTS", "SHIPPED", "active_joint", "shipped"]
 
 # Driven joint of each robot.
 ROBOTS = {"acrobot": 1, "pendubot": 0}
-# Policies that ship: those of the v2 boards by the robot's name, and those of other tasks.
-SHIPPED = (*ROBOTS, *(f"{task}_{robot}" for task in ("global", "hardware") for robot in ROBOTS))
+# Policies that ship: those of the v2 boards by the robot's name, and those of other recipes.
+OTHERS = ("learned", "global", "hardware")
+SHIPPED = (*ROBOTS, *(f"{recipe}_{robot}" for recipe in OTHERS for robot in ROBOTS))
 
 
 def active_joint(robot: str) -> int:

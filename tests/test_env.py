@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from brax.envs.base import Env as BraxEnv
 from brax.envs.wrappers import training
-from conftest import assert_close, both_robots
+from conftest import assert_close, both_robots, refused
 
 from jaxpend import JaxpendError, designs
-from jaxpend.boards import v2
+from jaxpend.boards import v2, v3
 from jaxpend.controllers import OpenLoop
 from jaxpend.env import Env, EnvConfig, Reward, restarted, surrogate_reward, truncated
 from jaxpend.interop.brax import DoublePendulum
@@ -206,6 +206,14 @@ def test_angles_alone_are_seen_as_they_change_and_no_velocity_matters(randomised
     # The critics know the velocity, with or without a scenario.
     true = [np.cos(state.x[:2]), np.sin(state.x[:2]), state.x[2:] / 10, [0.3]]
     np.testing.assert_allclose(state.privileged, np.concatenate(true), atol=1e-6)
+
+
+def test_angles_alone_are_not_enough_where_the_arm_is_thrown():
+    with refused("observation.kind is angles; where the arm is thrown by hand a policy must see"):
+        Env(
+            EnvConfig(observation=Observation("angles", history=1)),
+            named_board("pendubot", "v3").task,
+        )
 
 
 @both_robots

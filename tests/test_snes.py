@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import pytest
 from conftest import assert_close, refused, shipped_network, task_of
 
 from jaxpend import Policy, designs, snes
-from jaxpend.config import Objective
+from jaxpend.config import Objective, Strategy
 from jaxpend.controllers import load_reference, lqr, tvlqr
 from jaxpend.controllers.hybrid import with_lqr
 from jaxpend.score import Criteria, official, performance, score_v2
@@ -48,7 +49,7 @@ def evolved(config, policy, generations):
     return snes.evolve(config, policy, snes.init(config, policy, KEY), generations, TASK)
 
 
-@pytest.mark.parametrize("strategy", list(snes.STRATEGIES))
+@pytest.mark.parametrize("strategy", get_args(Strategy))
 def test_every_strategy_starts_at_the_controller_and_shrinks_as_told(toy_fitness, strategy):
     config = SNESConfig(
         generations=4, population=6, sigma=0.02, gain_sigma=0.05, final_sigma=1e-3,
@@ -66,7 +67,7 @@ def test_every_strategy_starts_at_the_controller_and_shrinks_as_told(toy_fitness
     assert 2e-6 < metrics["sigma"][-1] < 2e-4
 
 
-@pytest.mark.parametrize("strategy", list(snes.STRATEGIES))
+@pytest.mark.parametrize("strategy", get_args(Strategy))
 def test_the_search_climbs_the_fitness(toy_fitness, strategy):
     # Open-ES moves by a tenth of sigma a generation.
     generations = 100 if strategy == "open_es" else 40
