@@ -16,12 +16,17 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 import numpy as np
 
-from jaxpend import load_policy, save_policy
+from jaxpend import Controller, Scenario, load_policy, save_policy
+from jaxpend.boards import v2
 from jaxpend.controllers.policy import network_in
+from jaxpend.criteria import upright
 from jaxpend.files import write_atomically
+from jaxpend.rollout import final_state
 from jaxpend.score import official
+from jaxpend.variations import vary
 
 HERE = Path(__file__).parent
 ROBOTS = ("acrobot", "pendubot")
@@ -107,11 +112,29 @@ def train(recipe: str, robot: str, seed: int, runs: Path, flags: Sequence[str] =
     }
 
 
+def with_angle_noise(robot: str, controller: Controller, runs: int = 256) -> float:
+    """Share of runs on the nominal plant that end upright with 3 mrad of noise on the angles."""
+    scenario = Scenario(v2(robot).task.plant)
+    noisy = vary(scenario, {"position_noise": np.full(runs, 0.003)}, key=jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1), runs)
+    ends = jax.jit(jax.vmap(final_state, (0, None, 0)))(noisy, controller, keys)
+    return float(upright(ends).mean())
+
+
 def judged(robot: str, folder: Path) -> dict:
-    """``robustness`` of the policy of a run, which stays in the folder of the run."""
+    """``robustness`` of the policy of a run, which stays in the folder of the run.
+
+    With the share that stands under noise of the angles, guarded and alone.
+    """
     kept = folder / "robustness.json"
     if not kept.exists():
-        write_atomically(kept, json.dumps(robustness(robot, folder / "policy.npz")) + "\n")
+        found, guarded = (
+            robustness(robot, folder / "policy.npz"),
+            load_policy(folder / "policy.npz"),
+        )
+        found["angle_noise"] = with_angle_noise(robot, guarded)
+        found["angle_noise_network"] = with_angle_noise(robot, network_in(guarded))
+        write_atomically(kept, json.dumps(found) + "\n")
     return json.loads(kept.read_text())
 
 

@@ -210,10 +210,7 @@ def test_angles_alone_are_seen_as_they_change_and_no_velocity_matters(randomised
 
 def test_angles_alone_are_not_enough_where_the_arm_is_thrown():
     with refused("observation.kind is angles; where the arm is thrown by hand a policy must see"):
-        Env(
-            EnvConfig(observation=Observation("angles", history=1)),
-            named_board("pendubot", "v3").task,
-        )
+        Env(EnvConfig(observation=Observation("angles", history=1)), v3("pendubot").task)
 
 
 @both_robots
