@@ -19,8 +19,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxpend import Controller, Scenario, load_policy, save_policy
+from jaxpend import Scenario, load_policy, save_policy
 from jaxpend.boards import v2
+from jaxpend.controller import Controller
 from jaxpend.controllers.policy import network_in
 from jaxpend.criteria import upright
 from jaxpend.files import write_atomically
