@@ -52,9 +52,8 @@ def seen(policy: Any, run: Trajectory, key: jax.Array) -> jax.Array:
     def step(carry, now):
         return policy(carry, *now)[0], policy.look(carry, *now)
 
-    return jax.lax.scan(step, policy.reset(jax.random.split(key)[1]), (run.t[:-1], run.x_measured))[
-        1
-    ]
+    carry, times = policy.reset(jax.random.split(key)[1]), run.t[:-1]
+    return jax.lax.scan(step, carry, (times, run.x_measured))[1]
 
 
 @partial(jax.jit, static_argnames=("after", "task"))
