@@ -51,6 +51,7 @@ class Reward(Checked):
     phi1: NotNegative = 0.15  # change of the action, above the line
     phi2: NotNegative = 0.15  # change of the action, below
     eta: NotNegative = 0.02  # s^2, joint velocities squared, below
+    energy: NotNegative = 0.0  # distance of the energy from that of upright at rest, below
     # A step earns at least this; a spinning arm earns -100 and less.
     floor: Annotated[float, Bounds(most=0, infinite=True)] = -math.inf
 
@@ -78,10 +79,8 @@ class EnvConfig(Checked):
     reward: Reward = dataclasses.field(default_factory=Reward)
     max_speed: PositiveOrInfinite = math.inf  # rad/s; an episode is truncated beyond it
     upright_starts: Share = 0.0  # share of episodes that start near upright, not hanging
-    # rad, standard deviation of both angles there; 3/s of velocities.
-    upright_spread: Positive = 0.03
-    # Share of episodes that start anywhere: uniform angles, velocities with a standard deviation
-    # of 5 rad/s.
+    upright_spread: Positive = 0.03  # rad, standard deviation of both angles there; 3/s of speeds
+    # Share that starts anywhere: uniform angles, velocities with a standard deviation of 5 rad/s.
     random_starts: Share = 0.0
     thrown_starts: Share = 0.0  # share of episodes that start as a reset by hand leaves the arm
     # Share of episodes in a random scenario, see ``variations``; of the hardware task all are,
@@ -94,9 +93,8 @@ class EnvConfig(Checked):
             raise JaxpendError(f"dt is {self.dt}; it must not be longer than an episode")
         starts = {n: v for n, v in vars(self).items() if n.endswith("_starts") and v}
         if sum(starts.values()) > 1:
-            names, values = (
-                " and ".join(map(str, words)) for words in zip(*starts.items(), strict=True)
-            )
+            words = zip(*starts.items(), strict=True)
+            names, values = (" and ".join(map(str, each)) for each in words)
             raise JaxpendError(f"{names} are {values}; they are shares of one whole")
 
     @property
@@ -265,6 +263,8 @@ class GradientConfig(Checked):
     # Weight of the squared distance to the start's own actions in scenarios in which it stands.
     retention: NotNegative = 0.0
     retained_after: NotNegative = 2.0  # s, into a run; the swing-up before is free to change
+    # By how much the worth may fall below the best before the ascent goes back there.
+    tolerance: PositiveOrInfinite = 0.02
     chunk: Count = 20  # steps per report
 
     def __post_init__(self) -> None:

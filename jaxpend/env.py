@@ -20,6 +20,7 @@ from .config import EnvConfig, Reward
 from .errors import JaxpendError
 from .observation import Observation
 from .plant import (
+    UPRIGHT,
     Plant,
     forward_kinematics,
     joint_torque,
@@ -60,8 +61,10 @@ def surrogate_reward(plant: Plant, reward: Reward, line: float, x, action, befor
 
     With end-effector height y, potential and kinetic energy V and T, and action change da:
     ``V + alpha (1 + cos theta2)^2 - beta T - rho1 a^2 - phi1 |da|`` where y is above the line,
-    ``V - rho2 a^2 - phi2 |da| - eta (omega1^2 + omega2^2)`` below it, at least ``floor``. The
-    ``line`` is a height in m; that of the coefficients may be None.
+    ``V - rho2 a^2 - phi2 |da| - eta (omega1^2 + omega2^2) - energy |V + T - V*|`` below it, at
+    least ``floor``; V* is V upright, and the last term is ours, for torque limits within which it
+    takes several swings to get there. The ``line`` is a height in m; that of the coefficients may
+    be None.
     """
     height = forward_kinematics(plant, x)[1, 1]
     potential, kinetic = potential_energy(plant, x), kinetic_energy(plant, x)
@@ -70,6 +73,9 @@ def surrogate_reward(plant: Plant, reward: Reward, line: float, x, action, befor
     above = reward.alpha * straight - reward.beta * kinetic
     above = above - reward.rho1 * effort - reward.phi1 * change
     below = -reward.rho2 * effort - reward.phi2 * change - reward.eta * (x[2] ** 2 + x[3] ** 2)
+    if reward.energy:
+        upright = potential_energy(plant, jnp.asarray(UPRIGHT, x.dtype))
+        below = below - reward.energy * jnp.abs(potential + kinetic - upright)
     total = potential + jnp.where(height > line, above, below)
     return jnp.maximum(total, reward.floor)
 

@@ -15,7 +15,9 @@ scenarios in which it stands already (``retention``).
 Where motion is chaotic the gradient explodes and says nothing. Therefore the window is
 ``duration`` long, the norm of each run's gradient is clipped before they are averaged, a run
 whose gradient is not finite is left out and counted, and in scenarios the effect of a state on
-later states fades from the gradient, with the time constant ``memory``.
+later states fades from the gradient, with the time constant ``memory``. An ascent that loses more
+than ``tolerance`` of what it is worth goes back to its best, and on with half the rate: the smooth
+score can rise while the swing-up is being lost.
 """
 
 import math
@@ -50,6 +52,15 @@ __all__ = [
 
 
 @pytree
+class Reached(Pytree):
+    """Where an ascent has been, and what that is worth."""
+
+    parameters: jax.Array  # (parameters,)
+    optimizer: Any  # optax state
+    worth: jax.Array  # () as ``stage.value``; -inf: nobody has asked yet
+
+
+@pytree
 class GradientState(Pytree):
     """Everything that the ascent changes."""
 
@@ -57,6 +68,9 @@ class GradientState(Pytree):
     optimizer: Any  # optax state
     key: jax.Array
     lost: jax.Array  # () int, runs whose gradient was not finite, so far
+    rate: jax.Array  # () factor of the steps
+    worth: jax.Array  # () of the parameters
+    best: Reached
     retained: Retained | None = None  # with ``config.retention``
 
 
@@ -152,7 +166,9 @@ def init(
     """
     check_controller(controller)
     z, weights, _ = coordinates(controller, config.searched)
-    state = GradientState(z, _adam(config, weights).init(z), key, jnp.zeros((), jnp.int32))
+    optimizer, worth = _adam(config, weights).init(z), jnp.asarray(-jnp.inf)
+    rate, best = jnp.ones(()), Reached(z, optimizer, worth)
+    state = GradientState(z, optimizer, key, jnp.zeros((), jnp.int32), rate, worth, best)
     if not config.retention:
         return state
     _check_retention(controller)
@@ -193,8 +209,8 @@ def improve(
             found = jax.value_and_grad(lambda z: change(rebuild(z), kept, key_kept))(z)
             ascent, metrics = ascent - config.retention * found[1], metrics | {"change": found[0]}
         move, memory = optimizer.update(ascent, state.optimizer)
-        lost = state.lost + lost
-        state = state.replace(parameters=z + move, optimizer=memory, key=key, lost=lost)
+        lost, z = state.lost + lost, z + state.rate * move
+        state = state.replace(parameters=z, optimizer=memory, key=key, lost=lost)
         return state, metrics | {"slope": jnp.linalg.norm(ascent)}
 
     return jax.lax.scan(step, state, length=steps)
@@ -203,6 +219,19 @@ def improve(
 def current(config: GradientConfig, start: Controller, state: GradientState) -> Controller:
     """The controller at the parameters that the ascent has reached."""
     return coordinates(start, config.searched)[-1](state.parameters)
+
+
+def settled(state: GradientState, worth: float, tolerance: float) -> GradientState:
+    """The state of which it has become known what it is worth; it may go back to its best."""
+    now = Reached(state.parameters, state.optimizer, jnp.asarray(worth, state.worth.dtype))
+    best, rate = state.best, state.rate
+    if worth >= best.worth:
+        best = now
+    elif worth < best.worth - tolerance:
+        now, rate = best, rate / 2
+    return state.replace(
+        parameters=now.parameters, optimizer=now.optimizer, worth=now.worth, best=best, rate=rate
+    )
 
 
 class Gradient(SearchStage):
@@ -249,11 +278,31 @@ class Gradient(SearchStage):
             chunk = partial(devices.compute, chunk)
         return [chunk(state.start, state.search) for state in states]
 
+    def advance(self, states: list[SearchState]) -> list[tuple[SearchState, Row]]:
+        known = [
+            state if jnp.isfinite(state.search.best.worth) else self._settled(state)[0]
+            for state in states  # before the first step nobody has asked what it is worth
+        ]
+        after = []
+        for state, metrics in super().advance(known):
+            state, row = self._settled(state)
+            row |= {name: values[-1] for name, values in metrics.items()}
+            after.append((state, row | {"rate": state.search.rate}))
+        return after
+
+    def _settled(self, state: SearchState) -> tuple[SearchState, Row]:
+        score, worth = self.compared(current(self.config, state.start, state.search))
+        row = {"score": score, "value": worth, "lost": int(state.search.lost)}
+        search = settled(state.search, worth, self.config.tolerance)
+        return state.replace(search=search), row
+
     def judge(self, state: SearchState, metrics: Row) -> tuple[Row, Candidates]:
         policy = current(self.config, state.start, state.search)
+        if metrics:
+            return metrics, [(policy, float(state.search.worth))]
         score, worth = self.compared(policy)
         row = {"score": score, "value": worth, "lost": int(state.search.lost)}
-        return row | {name: values[-1] for name, values in metrics.items()}, [(policy, worth)]
+        return row, [(policy, worth)]
 
     def note(self, row: Row) -> str:
         return f"smooth score {float(row['smooth_score']):.4f}  score {row['score']:.4f}"
@@ -267,7 +316,7 @@ class ContestState(Pytree):
     """The ascents of several controllers, and which of them go on."""
 
     each: tuple[SearchState, ...]
-    worths: jax.Array  # (contestants,) what they are compared by; -inf: out
+    worths: jax.Array  # (contestants,) the most that they have been worth; -inf: out
 
 
 class Contest(Stage[tuple[Controller, ...], ContestState, Controller]):
@@ -311,8 +360,8 @@ class Contest(Stage[tuple[Controller, ...], ContestState, Controller]):
         order = np.argsort(-np.asarray(state.worths), kind="stable")
         each, worths, rows = list(state.each), np.full(len(order), -np.inf, "f4"), []
         for i in map(int, order[: self.kept(self.done(state))]):
-            [(each[i], metrics)] = self.inner.advance([each[i]])
-            row, [(_, worths[i])] = self.inner.judge(each[i], metrics)
+            [(each[i], row)] = self.inner.advance([each[i]])
+            worths[i] = each[i].search.best.worth
             rows.append(row)
         best = max(rows, key=lambda row: row["value"])
         row = best | {"contestants": len(rows), "lost": sum(row["lost"] for row in rows)}
@@ -324,11 +373,8 @@ class Contest(Stage[tuple[Controller, ...], ContestState, Controller]):
             candidates = [candidate for _, [candidate] in judged]
             return max((row for row, _ in judged), key=lambda row: row["value"]), candidates
         order = [int(i) for i in np.argsort(-np.asarray(state.worths), kind="stable")]
-        return metrics, [
-            (current(self.config, state.each[i].start, state.each[i].search), float(worth))
-            for i in order
-            if np.isfinite(worth := state.worths[i])
-        ]
+        still = [state.each[i] for i in order if np.isfinite(state.worths[i])]
+        return metrics, [self.inner.judge(one, metrics)[1][0] for one in still]
 
     def note(self, row: Row) -> str:
         return f"{row['contestants']} in the contest  {self.inner.note(row)}"

@@ -43,6 +43,7 @@ UNLIMITED = {
     ("Reward", "floor"): -math.inf,
     ("CheckpointConfig", "every"): math.inf,
     ("GradientConfig", "memory"): math.inf,
+    ("GradientConfig", "tolerance"): math.inf,
 }
 # Text that is looked at where it is used: names of files and of parts of a network.
 FREE_TEXT = {"coordinator", "run", "runs", "plant", "design", "policy", "controller", "searched"}

@@ -20,7 +20,7 @@ from jaxpend.controllers import OpenLoop
 from jaxpend.env import Env, EnvConfig, Reward, restarted, surrogate_reward, truncated
 from jaxpend.interop.brax import DoublePendulum
 from jaxpend.observation import KINDS, Observation
-from jaxpend.plant import rk4_step
+from jaxpend.plant import rk4_step, total_energy
 from jaxpend.rollout import rollout
 from jaxpend.scenario import Pulses
 from jaxpend.variations import sample
@@ -82,8 +82,9 @@ def test_the_cases_lie_on_both_sides_of_the_line():
 @pytest.mark.x64
 def test_coefficients_and_floor_are_those_of_the_configuration():
     plant = designs.competition("pendubot")
-    other = Reward(alpha=3.0, beta=0.5, rho1=1.0, rho2=2.0, phi1=3.0, phi2=4.0, eta=5.0)
-    zeroed = dict.fromkeys(("alpha", "beta", "rho1", "rho2", "phi1", "phi2", "eta"), 0.0)
+    other = Reward(alpha=3.0, beta=0.5, rho1=1.0, rho2=2.0, phi1=3.0, phi2=4.0, eta=5.0, energy=6.0)
+    names = ("alpha", "beta", "rho1", "rho2", "phi1", "phi2", "eta", "energy")
+    zeroed = dict.fromkeys(names, 0.0)
     for where in ("top", "hanging"):
         x = jnp.array(STATES[where])
 
@@ -97,12 +98,34 @@ def test_coefficients_and_floor_are_those_of_the_configuration():
         ]
         np.testing.assert_allclose(earned(other), earned(nothing) + sum(terms), rtol=1e-9)
         # Each side of the line has its own terms, and only those.
-        below = {"rho2", "phi2", "eta"}
+        below = {"rho2", "phi2", "eta", "energy"}
         at_work = {name for name, term in zip(zeroed, terms, strict=True) if term != 0}
         assert at_work == (set(zeroed) - below if where == "top" else below)
         assert (earned(other) < -0.5) == (where == "hanging")
         assert earned(dataclasses.replace(other, floor=-0.5)) == max(earned(other), -0.5)
         assert earned(dataclasses.replace(other, floor=-1e6)) == earned(other)
+
+
+@both_robots
+@pytest.mark.x64
+def test_energy_charges_the_distance_from_that_of_upright(robot):
+    """Too much costs as much as too little, and below the line alone."""
+    plant, kinds = designs.competition(robot), (Reward(energy=2.0), Reward())
+
+    def charged(x):
+        charging, free = (surrogate_reward(plant, kind, 0.3, x, 0.0, 0.0) for kind in kinds)
+        return float(free - charging)
+
+    upright, hanging = (total_energy(plant, jnp.array([q, 0.0, 0.0, 0.0])) for q in (np.pi, 0.0))
+    assert_close(charged(jnp.zeros(4)), 2 * (upright - hanging))
+    # Spinning through the lowest point, with a fifth more or less than it takes to stand.
+    moment = 2 * total_energy(plant, jnp.array([0.0, 0.0, 1.0, 0.0])) - 2 * hanging
+    for share in (0.8, 1.0, 1.2):
+        speed = np.sqrt(2 * share * (upright - hanging) / moment)
+        x = jnp.array([0.0, 0.0, speed, 0.0])
+        expected = 2 * abs(share - 1) * float(upright - hanging)
+        np.testing.assert_allclose(charged(x), expected, atol=1e-8)
+    assert charged(jnp.array([np.pi, 0.0, 3.0, 0.0])) == 0
 
 
 @both_robots

@@ -158,6 +158,33 @@ def test_retention_pulls_back_to_what_the_start_did(monkeypatch):
     assert gradient.init(free, start, KEY).retained is None
 
 
+def test_an_ascent_that_loses_goes_back_to_its_best_with_half_the_rate(monkeypatch):
+    """Judged are, in turn, the start and what each step has come to."""
+    worths = iter([0.6, 0.65, 0.64, 0.62, 0.66])
+    monkeypatch.setattr(gradient.Gradient, "compared", lambda *_: (0.0, next(worths)))
+    monkeypatch.setattr(gradient, "slope", lambda c, s, t, z, k: (jnp.ones_like(z), 0, {}))
+    config = GradientConfig(steps=40, chunk=1, learning_rate=0.5, duration=0.1)
+    stage = gradient.Gradient(config, start := network(), TASK)
+    states = [stage.start(0, start)]
+    for _ in range(4):
+        [(state, row)] = stage.advance(states[-1:])
+        _, [(policy, worth)] = stage.judge(state, row)
+        states.append(state)
+    search = [state.search for state in states]
+    np.testing.assert_allclose([s.rate for s in search], [1, 1, 1, 0.5, 0.5])
+    # The third step lost 0.03, more than the tolerance, the second one less.
+    assert np.any(search[2].parameters != search[1].parameters)
+    np.testing.assert_array_equal(search[3].parameters, search[1].parameters)
+    assert search[3].worth == search[1].worth
+    before, again = search[2], search[4]
+    step, half = before.parameters - search[1].parameters, again.parameters - search[3].parameters
+    np.testing.assert_allclose(half, step / 2, rtol=1e-4)
+    assert worth == again.worth == again.best.worth
+    np.testing.assert_array_equal(
+        policy.layers[0][0], gradient.current(config, start, again).layers[0][0]
+    )
+
+
 def test_retention_is_of_a_policy_alone():
     config = GradientConfig(retention=1.0)
     with refused("it needs a policy without a guard"):
@@ -216,6 +243,7 @@ def test_gains_of_any_controller_climb_with_a_step_of_their_own():
         ({"memory": float("nan")}, "memory is nan; it must be positive"),
         ({"scenarios": -1}, "scenarios is -1; it must not be negative"),
         ({"scenarios": 4}, "scenarios is 4; with objective.weight 0 they count nothing"),
+        ({"tolerance": 0.0}, "tolerance is 0.0; it must be positive"),
         ({"retention": -1.0}, "retention is -1.0; it must not be negative"),
     ],
 )
