@@ -25,10 +25,11 @@ BOARD_global := v3
 
 # What `make train` reads: a recipe that ships with the package.
 CONFIG = $(if $(filter v2,$(TASK)),$(CONFIG_OF_RECIPE),$(TASK)_$(ROBOT))
-CONFIG_OF_RECIPE = $(or $(CONFIG_$(RECIPE)),$(error RECIPE is '$(RECIPE)'; it must be demonstrated, learned or plain))
+CONFIG_OF_RECIPE = $(or $(CONFIG_$(RECIPE)),$(error RECIPE is '$(RECIPE)'; it must be demonstrated, learned, low_torque or plain))
 CONFIG_demonstrated := $(ROBOT)
 CONFIG_learned := learned_$(ROBOT)
 CONFIG_plain := plain
+CONFIG_low_torque := low_torque
 
 .DEFAULT_GOAL := help
 .PHONY: help install train snes score robustness hardware leaderboard runs report docs test lint bench clean
@@ -36,7 +37,7 @@ CONFIG_plain := plain
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 	@echo
-	@echo "variables: ROBOT=acrobot|pendubot  TASK=v2|global|hardware  RECIPE=demonstrated|learned|plain  SEED=0  RUN=name  ARGS='--sac.steps 100000'"
+	@echo "variables: ROBOT=acrobot|pendubot  TASK=v2|global|hardware  RECIPE=demonstrated|learned|low_torque|plain  SEED=0  RUN=name  ARGS='--sac.steps 100000'"
 	@echo "the command behind them, with its own --help: $(BIN)/jaxpend"
 
 $(STAMP): pyproject.toml .constraints.txt

@@ -32,7 +32,7 @@ from jaxpend.variations import vary
 HERE = Path(__file__).parent
 ROBOTS = ("acrobot", "pendubot")
 STAGES = {"sac": "SAC", "openings": "openings", "gradient": "gradient", "snes": "SNES"}
-# What a recipe changes of the robot's own; "plain" and "learned" have files of their own.
+# What a recipe changes of the robot's own; those of ``ALONE`` have files of their own.
 RECIPES = {
     "shipped": [],
     "no pulses": ["--sac.demonstrations.pulses", "0"],
@@ -48,7 +48,10 @@ RECIPES = {
     ],
     "plain": [],
     "learned": [],
+    "low_torque": [],
 }  # fmt: skip
+# From the reward alone, without imitation: the configuration of each.
+ALONE = {"plain": "plain", "learned": "learned_{}", "low_torque": "low_torque"}
 # What is taken from the policy that the shipped recipe ended with; nothing is trained again.
 TAKEN = {
     "no observer": {"observer": None},
@@ -89,7 +92,7 @@ def train(recipe: str, robot: str, seed: int, runs: Path, flags: Sequence[str] =
     folder = folder_of(recipe, robot, seed, runs)
     if not (folder / "result.json").exists():
         # Relative: the command goes into the policy files.
-        config = {"plain": "plain", "learned": f"learned_{robot}"}.get(recipe, robot)
+        config = ALONE.get(recipe, "{}").format(robot)
         command = [sys.executable, "-m", "jaxpend.train", "--config", config]
         command += ["--robot", robot, "--seed", str(seed)]
         command += ["--runs", str(runs), "--run", folder.name]
@@ -106,9 +109,9 @@ def train(recipe: str, robot: str, seed: int, runs: Path, flags: Sequence[str] =
         "recipe": recipe,
         "robot": robot,
         "seed": seed,
-        "imitation": None if recipe in ("plain", "learned") else first["score"],
+        "imitation": None if recipe in ALONE else first["score"],
         **{n: {k: result[n][k] for k in keys} for n in STAGES if n in result},
-        "criteria": result["snes"]["criteria"],
+        "criteria": result[[n for n in STAGES if n in result][-1]]["criteria"],
         "robustness": judged(robot, folder),
     }
 

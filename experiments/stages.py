@@ -1,0 +1,95 @@
+"""What each stage of the learned recipe brings: score and robustness after it, of every seed.
+
+    python experiments/stages.py runs/learned/learned-*
+
+writes stages.md and stages.json beside this file. A policy is judged twice: alone, and behind the
+guard that the run puts around what the gradient ends with. What is already in the folder of a run
+is kept.
+"""
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxpend import load_policy
+from jaxpend.config import TrainRun
+from jaxpend.config_files import load_config
+from jaxpend.controllers import guard
+from jaxpend.controllers.policy import network_in
+from jaxpend.robustness import benchmark
+from jaxpend.score import official
+
+HERE = Path(__file__).parent
+STAGES = {"sac": "SAC", "openings": "openings", "gradient": "gradient", "snes": "SNES"}
+COLUMNS = ("score", "alone", "guarded")
+
+
+def robustness(controller, robot: str) -> float:
+    """Median over five benchmark keys."""
+    return benchmark(controller, robot, jax.random.key(0), keys=5).overall
+
+
+def judged(folder: Path) -> dict:
+    """Stage -> score, and robustness alone and guarded, of the best policy of each stage."""
+    kept = folder / "stages.json"
+    if kept.exists():
+        return json.loads(kept.read_text())
+    run, found = load_config(TrainRun(), folder / "config.json"), {}
+    for stage in STAGES:
+        policy = load_policy(folder / f"{stage}_best.npz")
+        network = network_in(policy)
+        guarded = policy
+        if guarded is network:
+            guarded = guard(network, run.robot, **dataclasses.asdict(run.guard))
+        found[stage] = {
+            "score": official(policy, run.robot)["score"],
+            "alone": robustness(network, run.robot),
+            "guarded": robustness(guarded, run.robot),
+        }
+    found = {"robot": run.robot, "seed": run.seed, "stages": found}
+    kept.write_text(json.dumps(found) + "\n")
+    return found
+
+
+def table(rows: list[dict]) -> str:
+    """A Markdown table with a row for each seed, and the medians."""
+    lines = [
+        "Score / robustness alone / guarded (median of five benchmark keys) of the best policy of "
+        "each stage.",
+        "",
+        "| robot | seed | " + " | ".join(STAGES.values()) + " |",
+        "|---" * (2 + len(STAGES)) + "|",
+    ]
+
+    def line(robot, seed, numbers):
+        cells = ["{score:.3f} / {alone:.3f} / {guarded:.3f}".format(**numbers[s]) for s in STAGES]
+        return f"| {robot} | {seed} | " + " | ".join(cells) + " |"
+
+    for robot in dict.fromkeys(row["robot"] for row in rows):
+        group = [row for row in rows if row["robot"] == robot]
+        lines += [line(robot, row["seed"], row["stages"]) for row in group]
+        medians = {
+            s: {c: float(np.median([row["stages"][s][c] for row in group])) for c in COLUMNS}
+            for s in STAGES
+        }
+        lines.append(line(robot, "median", medians))
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Judge what is missing and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folders", nargs="+", type=Path, help="run folders")
+    rows = [judged(folder) for folder in parser.parse_args().folders]
+    rows.sort(key=lambda row: (row["robot"], row["seed"]))
+    (HERE / "stages.json").write_text(json.dumps(rows, indent=1) + "\n")
+    (HERE / "stages.md").write_text(table(rows))
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
