@@ -156,7 +156,8 @@ def draw_over_limits(
     axes.set_xscale("log")
     axes.set_xticks(limits, [f"{limit:g}" for limit in limits])
     axes.minorticks_off()
-    axes.set(xlabel="torque limit [N m]", ylabel=label, ylim=(0, None), title=robot)
+    top = 1.1 * axes.dataLim.y1
+    axes.set(xlabel="torque limit [N m]", ylabel=label, ylim=(0, top), title=robot)
 
 
 def draw(rows: list[dict], ceilings: dict, path: Path) -> None:
