@@ -27,6 +27,7 @@ from seeds import ROBOTS, STAGES, folder_of, train
 from jaxpend import designs
 from jaxpend.boards import v2
 from jaxpend.controllers import load_reference, tvlqr
+from jaxpend.errors import JaxpendError
 from jaxpend.report.figures import PALETTE, save, stack
 from jaxpend.score import official
 from jaxpend.trajopt.search import Search, find
@@ -55,7 +56,10 @@ def ceiling(robot: str, limit: float, runs: Path, starts: int) -> dict:
                 print(f"{robot}, {limit:g} N m: {line}", file=sys.stderr)
 
             config = Search(torque_limit=limit, starts=starts)
-            measured = find(v2(robot).task, config, say=say)[0][1]
+            try:
+                measured = find(v2(robot).task, config, say=say)[0][1]
+            except JaxpendError:  # no start stood within the horizon
+                measured = {"score": None, "criteria": {"energy": None, "max_tau": None}}
     spent = {"energy": measured["criteria"]["energy"], "peak": measured["criteria"]["max_tau"]}
     result = {"score": measured["score"], "found": found} | spent
     path.write_text(json.dumps(result))
@@ -119,7 +123,11 @@ def table(rows: list[dict], ceilings: dict) -> str:
         seeds = ", ".join(str(r["seed"]) for r in group)
         best = ceilings[robot][str(limit)]
         cells = [TITLES[recipe], robot, f"{limit:g} N m", seeds, *numbers]
-        cells += [f"{best['score']:.4f}", f"{best['energy']:.1f}", f"{best['peak']:.2f}"]
+        digits = {"score": 4, "energy": 1, "peak": 2}
+        cells += [
+            "none found" if best[name] is None else f"{best[name]:.{d}f}"
+            for name, d in digits.items()
+        ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
@@ -151,7 +159,7 @@ def draw_over_limits(
             medians.append((limit, np.median(values)))
         if medians:
             axes.plot(*zip(*medians, strict=True), color=PALETTE[colour])
-    best = [ceilings[robot][str(limit)][name] for limit in limits]
+    best = np.array([ceilings[robot][str(limit)][name] for limit in limits], float)
     axes.plot(limits, best, "--", color=PALETTE["ink"], label="ceiling")
     axes.set_xscale("log")
     axes.set_xticks(limits, [f"{limit:g}" for limit in limits])
