@@ -14,6 +14,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from seeds import STAGES
 
 from jaxpend import load_policy
 from jaxpend.config import TrainRun
@@ -24,7 +25,6 @@ from jaxpend.robustness import benchmark
 from jaxpend.score import official
 
 HERE = Path(__file__).parent
-STAGES = {"sac": "SAC", "openings": "openings", "gradient": "gradient", "snes": "SNES"}
 COLUMNS = ("score", "alone", "guarded")
 
 

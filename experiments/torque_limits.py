@@ -207,7 +207,7 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
     ceilings = {
         robot: {str(a): ceiling(robot, a, folder, args.starts) for a, folder in folders.items()}
-        for robot in args.robots
+        for robot in sorted({*args.robots, *(r["robot"] for r in rows)})
     }
     for recipe, robot, limit, seed in jobs:
         folder = folder_of(recipe, robot, seed, folders[limit])
