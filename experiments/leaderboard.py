@@ -23,8 +23,8 @@ def merged(path: Path, robot: str, row: dict) -> dict:
     boards = json.loads(path.read_text()) if path.exists() else {}
     rows = boards.get(robot, {}).get("rows", [])
     rows = [r for r in rows if r["source"] == "measured" and r["name"] != row["name"]]
-    rows = [*rows, row, *leaderboard.published(v2(robot))]
-    boards[robot] = {"robot": robot, "rows": sorted(rows, key=lambda r: -r["score"])}
+    rows = sorted([*rows, row, *leaderboard.published(v2(robot))], key=lambda r: -r["score"])
+    boards[robot] = {"robot": robot, "rows": rows}
     return boards
 
 
@@ -57,6 +57,8 @@ def main(
             row |= leaderboard.judge(make, v2(robot), **options)
             boards = merged(path, robot, row)
             cli.emit_json(boards, path)
+            for known, board in boards.items():
+                board["columns"] = v2(known).columns
             tables = [(r, leaderboard.markdown(boards[r])) for r in designs.ROBOTS if r in boards]
             text = "\n".join(f"## {r}\n\n{table}" for r, table in tables)
             write_atomically(path.with_suffix(".md"), intro + text)

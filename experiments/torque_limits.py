@@ -5,7 +5,7 @@
 writes torque_limits.json, .md and .png beside this file. The ceiling is the best score of a
 trajectory: of the shipped swing-up where it fits, else of the one that `jaxpend optimise` finds.
 What is already in the folder of runs is kept, so an interrupted study goes on where it was, and so
-are the rows of the file that are of other limits, recipes or seeds.
+are the ceilings of the file, and its rows of other limits, recipes or seeds.
 """
 
 import argparse
@@ -199,14 +199,18 @@ def main() -> None:
     args = parser.parse_args()
     found = HERE / "torque_limits.json"
     jobs = list(itertools.product(args.recipes, args.robots, args.limits, args.seeds))
-    rows = json.loads(found.read_text())["rows"] if found.exists() else []
-    rows = [r for r in rows if tuple(r[name] for name in NAMES) not in jobs]
+    kept = json.loads(found.read_text()) if found.exists() else {"rows": [], "ceilings": {}}
+    rows = [r for r in kept["rows"] if tuple(r[name] for name in NAMES) not in jobs]
     limits = sorted({*args.limits, *(r["torque_limit"] for r in rows)})
     folders = {limit: args.runs / f"{limit:g}" for limit in limits}
     for folder in folders.values():
         folder.mkdir(parents=True, exist_ok=True)
     ceilings = {
-        robot: {str(a): ceiling(robot, a, folder, args.starts) for a, folder in folders.items()}
+        robot: {
+            str(a): kept["ceilings"].get(robot, {}).get(str(a))
+            or ceiling(robot, a, folder, args.starts)
+            for a, folder in folders.items()
+        }
         for robot in sorted({*args.robots, *(r["robot"] for r in rows)})
     }
     for recipe, robot, limit, seed in jobs:

@@ -40,7 +40,10 @@ def start(policy, tmp_path):
         line = [sys.executable, "-m", "jaxpend", "snes", "--robot", "pendubot"]
         line += ["--policy", str(policy), "--snes.generations", str(generations), *SETTINGS]
         line += ["--runs", str(tmp_path), "--run", name, *more]
+        # They can be interrupted, even if these tests run in the background of a shell.
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
         begun.append(subprocess.Popen(line, stderr=subprocess.PIPE, text=True))
+        signal.signal(signal.SIGINT, before)
         return begun[-1]
 
     yield of
