@@ -1,9 +1,9 @@
 # `make` alone lists what there is. Variables: ROBOT, TASK, RECIPE, SEED, RUN (name of the run), ARGS.
 ROBOT ?= pendubot
 TASK ?= v2
-RECIPE ?= demonstrated
+RECIPE ?= learned
 SEED ?= 0
-RUN ?= $(ROBOT)$(if $(filter v2,$(TASK)),$(if $(filter demonstrated,$(RECIPE)),,-$(RECIPE)),-$(TASK))-seed$(SEED)
+RUN ?= $(ROBOT)$(if $(filter v2,$(TASK)),$(if $(filter learned,$(RECIPE)),,-$(RECIPE)),-$(TASK))-seed$(SEED)
 ARGS ?=
 PYTHON ?= python3
 VENV := .venv
@@ -25,9 +25,9 @@ BOARD_global := v3
 
 # What `make train` reads: a recipe that ships with the package.
 CONFIG = $(if $(filter v2,$(TASK)),$(CONFIG_OF_RECIPE),$(TASK)_$(ROBOT))
-CONFIG_OF_RECIPE = $(or $(CONFIG_$(RECIPE)),$(error RECIPE is '$(RECIPE)'; it must be demonstrated, learned, low_torque or plain))
-CONFIG_demonstrated := $(ROBOT)
-CONFIG_learned := learned_$(ROBOT)
+CONFIG_OF_RECIPE = $(or $(CONFIG_$(RECIPE)),$(error RECIPE is '$(RECIPE)'; it must be learned, demonstrated, low_torque or plain))
+CONFIG_learned := $(ROBOT)
+CONFIG_demonstrated := demonstrated_$(ROBOT)
 CONFIG_plain := plain
 CONFIG_low_torque := low_torque
 
@@ -37,7 +37,7 @@ CONFIG_low_torque := low_torque
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 	@echo
-	@echo "variables: ROBOT=acrobot|pendubot  TASK=v2|global|hardware  RECIPE=demonstrated|learned|low_torque|plain  SEED=0  RUN=name  ARGS='--sac.steps 100000'"
+	@echo "variables: ROBOT=acrobot|pendubot  TASK=v2|global|hardware  RECIPE=learned|demonstrated|low_torque|plain  SEED=0  RUN=name  ARGS='--sac.steps 100000'"
 	@echo "the command behind them, with its own --help: $(BIN)/jaxpend"
 
 $(STAMP): pyproject.toml .constraints.txt

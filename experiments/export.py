@@ -8,7 +8,6 @@ gcc -O2 for C, ONNX Runtime with one thread, and jax compiled on the CPU in a lo
 """
 
 import ctypes
-import itertools
 import subprocess
 import tempfile
 import time
@@ -22,10 +21,8 @@ import onnxruntime
 from jaxpend import load_policy, rollout
 from jaxpend.boards import named_board, v2
 from jaxpend.controllers.catalogue import build
-from jaxpend.controllers.guard import guard
-from jaxpend.controllers.policy import Policy, network_in
+from jaxpend.controllers.policy import network_in
 from jaxpend.interop import c, numpy, onnx
-from jaxpend.observation import Observation
 
 MAIN = """
 #include "controller.h"
@@ -39,23 +36,11 @@ void run(int n, const float *t, const float *x, float *torque)
 REPEAT = 20
 
 
-def with_history() -> Policy:
-    """Weights that are drawn, of a network as large as those that ship."""
-    draw, observation = np.random.default_rng(0), Observation(history=4)
-    sizes = (observation.size, 64, 64, 1)
-    layers = tuple(
-        (jnp.asarray(draw.normal(size=(a, b)) / a**0.5), jnp.asarray(draw.normal(size=b)))
-        for a, b in itertools.pairwise(sizes)
-    )
-    return Policy(layers, jnp.asarray(3.0), observation=observation)
-
-
 CONTROLLERS = {
-    "policy alone": lambda: network_in(load_policy("pendubot")),
-    "policy with a history of 4": with_history,
+    "demonstrated_pendubot, policy alone": lambda: network_in(load_policy("demonstrated_pendubot")),
+    "pendubot, policy alone (history of 4)": lambda: network_in(load_policy("pendubot")),
     "pendubot, as it ships (guarded)": lambda: load_policy("pendubot"),
     "acrobot, as it ships (guarded)": lambda: load_policy("acrobot"),
-    "guard around the history": lambda: guard(with_history(), "pendubot"),
     "acrobot, for real robots": lambda: load_policy("hardware_acrobot"),
     "TVLQR, guarded": lambda: build("tvlqr_guarded", v2("pendubot").task.plant, "pendubot"),
 }

@@ -33,7 +33,7 @@ SENSORS = {  # heading -> variation and value
 }
 SENSED = 64  # runs each
 STIFF = "TVLQR ending in LQR, which tolerates less delay"
-SHIPPED = "the network that ships"
+IMITATED = "the network that imitates it"
 
 
 def variants(robot: str) -> dict[str, dict]:
@@ -43,8 +43,8 @@ def variants(robot: str) -> dict[str, dict]:
     return {
         "as it is": {},
         STIFF: {},
-        SHIPPED: {},
-        f"{SHIPPED}, no guard": {"observe": False, "rescue": False},
+        IMITATED: {},
+        f"{IMITATED}, no guard": {"observe": False, "rescue": False},
         "no guard": {"observe": False, "rescue": False},
         "observer alone": {"rescue": False},
         "rescue alone": {"observe": False},
@@ -121,12 +121,12 @@ def main(runs: int = 1024, seed: int = 0, out: Path = Path(__file__).parent / "g
         keys = jax.random.split(jax.random.key(seed + 1), len(kinds))
         demonstrated = tvlqr(plant, load_reference(robot), r=10.0, delay=0.044)
         stiff = tvlqr(plant, load_reference(robot), r=10.0)
-        shipped = network_in(load_policy(robot))
+        imitated = network_in(load_policy(f"demonstrated_{robot}"))
         lines += ["", f"## {robot}", "", "| guard | all | " + " | ".join([*KINDS, *SENSORS]) + " |"]
         lines += ["|---|" + "---:|" * (1 + len(KINDS) + len(SENSORS))]
         for name, changes in variants(robot).items():
             print(robot, name, file=sys.stderr)
-            network = shipped if name.startswith(SHIPPED) else demonstrated
+            network = imitated if name.startswith(IMITATED) else demonstrated
             guarded = build(stiff if name == STIFF else network, robot, changes)
             ok = np.asarray(survives(guarded, scenarios, keys))
             cells = [ok.mean(), *(ok[kinds == i].mean() for i in range(len(KINDS)))]

@@ -6,10 +6,10 @@ writes search.json and search.md beside this file. What is in the json is not me
 
 1. Step sizes. Every method gets some, from two policies that are not among those of part 2, in
    half the time; the best by the score it ends with is used from then on.
-2. The score: every method from policies that imitate, of few and of all updates of the recipe, and
-   from policies of SAC alone, which hardly swing up. Three seeds.
+2. The score: every method from policies that imitate, of few and of all updates of that recipe,
+   and from policies of SAC alone, which hardly swing up. Three seeds.
 3. Robustness: methods that meet random scenarios against one that does not, around guarded
-   policies, as in the recipe, and around a network alone. Judged by scenarios that no method met.
+   policies, as in that recipe, and around a network alone. Judged by scenarios that no method met.
 
 All is done by the stages of ``jaxpend train``, in their chunks; judging between chunks is in the
 time, compilation is not. A method keeps its best candidate as the commands do: by the official
@@ -78,7 +78,7 @@ def start_of(kind: str, robot: str, seed: int, runs: Path):
     if not (folder / "policy.npz").exists():
         config = SACRun(robot=robot, seed=seed, runs=str(runs), run=folder.name)
         if kind != "sac":  # fewer steps than the actor's delay: imitation alone
-            config = load_config(config, robot, also=("snes", "guard"))
+            config = load_config(config, f"demonstrated_{robot}", also=("snes", "guard"))
             shown = dataclasses.replace(config.sac.demonstrations, updates=int(kind))
             sac = dataclasses.replace(config.sac, demonstrations=shown, steps=32)
             config = dataclasses.replace(config, sac=sac)

@@ -1,6 +1,7 @@
 """Train several seeds of both robots, two single-threaded runs at a time, and tabulate them.
 
-    python experiments/seeds.py --seeds 0 1 2
+    python experiments/seeds.py
+    python experiments/seeds.py --recipes demonstrated --seeds 0 1 2 --out demonstrated
 
 writes experiments/seeds.json and experiments/seeds.md (or what --out names). A run that is already
 there is kept, so an interrupted sweep goes on where it was.
@@ -32,9 +33,9 @@ from jaxpend.variations import vary
 HERE = Path(__file__).parent
 ROBOTS = ("acrobot", "pendubot")
 STAGES = {"sac": "SAC", "openings": "openings", "gradient": "gradient", "snes": "SNES"}
-# What a recipe changes of the robot's own; those of ``ALONE`` have files of their own.
+# What a recipe changes of the file that it begins with (``ALONE``, or the demonstrated one).
 RECIPES = {
-    "shipped": [],
+    "demonstrated": [],
     "no pulses": ["--sac.demonstrations.pulses", "0"],
     "with gradient": [
         "--gradient.steps", "600", "--snes.sigma", "0.0003", "--snes.generations", "100",
@@ -51,8 +52,8 @@ RECIPES = {
     "low_torque": [],
 }  # fmt: skip
 # From the reward alone, without imitation: the configuration of each.
-ALONE = {"plain": "plain", "learned": "learned_{}", "low_torque": "low_torque"}
-# What is taken from the policy that the shipped recipe ended with; nothing is trained again.
+ALONE = {"plain": "plain", "learned": "{}", "low_torque": "low_torque"}
+# What is taken from the policy that the demonstrated recipe ended with; nothing is trained again.
 TAKEN = {
     "no observer": {"observer": None},
     "no rescue": {"rescue": None},
@@ -92,7 +93,7 @@ def train(recipe: str, robot: str, seed: int, runs: Path, flags: Sequence[str] =
     folder = folder_of(recipe, robot, seed, runs)
     if not (folder / "result.json").exists():
         # Relative: the command goes into the policy files.
-        config = ALONE.get(recipe, "{}").format(robot)
+        config = ALONE.get(recipe, "demonstrated_{}").format(robot)
         command = [sys.executable, "-m", "jaxpend.train", "--config", config]
         command += ["--robot", robot, "--seed", str(seed)]
         command += ["--runs", str(runs), "--run", folder.name]
@@ -143,8 +144,8 @@ def judged(robot: str, folder: Path) -> dict:
 
 
 def without(recipe: str, robot: str, seed: int, runs: Path) -> dict:
-    """A row for the policy of a run of the shipped recipe with a part of its guard taken away."""
-    folder = folder_of("shipped", robot, seed, runs)
+    """A row for the policy of a demonstrated run with a part of its guard taken away."""
+    folder = folder_of("demonstrated", robot, seed, runs)
     path = folder / f"{recipe}.npz".replace(" ", "-")
     save_policy(path, load_policy(folder / "policy.npz").replace(**TAKEN[recipe]))
     found = official(load_policy(path), robot)
@@ -192,8 +193,8 @@ def table(rows: list[dict], jobs: int) -> str:
 def main() -> None:
     """Run what is missing and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--recipes", nargs="+", default=["shipped"], choices=[*RECIPES, *TAKEN])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--recipes", nargs="+", default=["learned"], choices=[*RECIPES, *TAKEN])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[*range(5)])
     parser.add_argument("--robots", nargs="+", default=ROBOTS, choices=ROBOTS)
     parser.add_argument("--runs", type=Path, default=Path("runs/seeds"))
     parser.add_argument("--out", default="seeds", help="name of the .json and .md beside this file")

@@ -1,10 +1,10 @@
-"""What each stage of the learned recipe brings: score and robustness after it, of every seed.
+"""What each stage of the recipe brings: score and robustness after it, of every seed.
 
     python experiments/stages.py runs/learned/learned-*
 
 writes stages.md and stages.json beside this file. A policy is judged twice: alone, and behind the
-guard that the run puts around what the gradient ends with. What is already in the folder of a run
-is kept.
+guard that the run puts around what the gradient ends with; guarded also in random scenarios, of
+which training sees none. What is already in the folder of a run is kept.
 """
 
 import argparse
@@ -17,15 +17,18 @@ import numpy as np
 from seeds import STAGES
 
 from jaxpend import load_policy
+from jaxpend.boards import v2
 from jaxpend.config import TrainRun
 from jaxpend.config_files import load_config
 from jaxpend.controllers import guard
 from jaxpend.controllers.policy import network_in
 from jaxpend.robustness import benchmark
 from jaxpend.score import official
+from jaxpend.stage import standing
 
 HERE = Path(__file__).parent
-COLUMNS = ("score", "alone", "guarded")
+CELL = "{score:.3f} / {alone:.3f} / {guarded:.3f} / {stands:.3f}"
+COLUMNS = ("score", "alone", "guarded", "stands")
 
 
 def robustness(controller, robot: str) -> float:
@@ -49,6 +52,7 @@ def judged(folder: Path) -> dict:
             "score": official(policy, run.robot)["score"],
             "alone": robustness(network, run.robot),
             "guarded": robustness(guarded, run.robot),
+            "stands": standing(guarded, v2(run.robot).task),
         }
     found = {"robot": run.robot, "seed": run.seed, "stages": found}
     kept.write_text(json.dumps(found) + "\n")
@@ -58,14 +62,15 @@ def judged(folder: Path) -> dict:
 def table(rows: list[dict]) -> str:
     """A Markdown table with a row for each seed, and the medians."""
     lines = [
-        "Score / robustness alone / guarded (one benchmark key) of the best policy of each stage.",
+        "Score / robustness alone / guarded (one benchmark key) / share of 1024 random scenarios",
+        "in which it stands guarded, of the best policy of each stage.",
         "",
         "| robot | seed | " + " | ".join(STAGES.values()) + " |",
         "|---" * (2 + len(STAGES)) + "|",
     ]
 
     def line(robot, seed, numbers):
-        cells = ["{score:.3f} / {alone:.3f} / {guarded:.3f}".format(**numbers[s]) for s in STAGES]
+        cells = [CELL.format(**numbers[s]) for s in STAGES]
         return f"| {robot} | {seed} | " + " | ".join(cells) + " |"
 
     for robot in dict.fromkeys(row["robot"] for row in rows):

@@ -153,7 +153,7 @@ for _ in range(2 if SHORT else 20):
     print(f"{int(state.env_steps):,} steps, mean reward {float(metrics['reward']):.3f}")
 learned = sac.greedy_policy(agent, state)
 score = official(learned, board)["score"]
-print(f"the score is {score:.4f}: so few steps teach it nothing yet; jaxpend train takes 400,000")
+print(f"the score is {score:.4f}: so few steps teach it nothing yet; jaxpend train takes 2,400,000")
 save_policy(OUT / "learned.npz", learned)  # load_policy reads it, and every command takes it
 
 # %% Looking at it: charts draw on the axes they are given

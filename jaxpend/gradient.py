@@ -333,6 +333,7 @@ class Contest(Stage[tuple[Controller, ...], ContestState, Controller]):
     def __init__(self, config: GradientConfig, policy: Any, task: Task, contestants: int):
         self.inner, self.contestants = Gradient(config, policy, task), contestants
         self.config, self.policy, self.total = config, policy, config.steps
+        self.objective = config.objective
 
     def start(self, seed: int, before: tuple[Controller, ...]) -> ContestState:
         each = tuple(self.inner.start(seed, controller) for controller in before)

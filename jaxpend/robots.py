@@ -9,8 +9,8 @@ __all__ = ["ROBOTS", "SHIPPED", "active_joint", "shipped"]
 
 # Driven joint of each robot.
 ROBOTS = {"acrobot": 1, "pendubot": 0}
-# Policies that ship: those of the v2 boards by the robot's name, and those of other recipes.
-OTHERS = ("learned", "global", "hardware")
+# Policies that ship: what ``make train`` learns by the robot's name, and what other recipes do.
+OTHERS = ("demonstrated", "global", "hardware")
 SHIPPED = (*ROBOTS, *(f"{recipe}_{robot}" for recipe in OTHERS for robot in ROBOTS))
 
 

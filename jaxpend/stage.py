@@ -21,7 +21,7 @@ from .pytree import Pytree, pytree
 from .score import combined, imperfect, nominal
 from .task import Task
 
-__all__ = ["Candidates", "Chart", "Row", "SearchStage", "SearchState", "Stage", "value"]
+__all__ = ["Candidates", "Chart", "Row", "SearchStage", "SearchState", "Stage", "standing", "value"]
 
 Row = dict[str, Any]  # of metrics
 Candidates = list[tuple[Controller, float]]  # with their scores
@@ -53,6 +53,7 @@ class Stage(Protocol[Before, State, After]):
     ties: ClassVar[bool] = False  # whether a policy as good as the best replaces it
 
     total: int
+    objective: Objective = Objective()  # what candidates are compared by, see ``value``
 
     @classmethod
     def of(cls, run: Run, start: Controller | None, task: Task) -> "Stage | None":
@@ -104,6 +105,8 @@ class Stage(Protocol[Before, State, After]):
 
 # Of the scenarios on which candidates are compared: no seed of a run, and no key of the benchmark.
 VALIDATION_SEED = 2**31 - 1
+# Of those in which people are told how often the result stands, and how many there are.
+STANDING_SEED, STANDING = 2**31 - 2, 1024
 
 
 @partial(jax.jit, static_argnames=("objective", "task"))
@@ -122,6 +125,19 @@ def value(objective: Objective, controller: Controller, score: float, task: Task
         return score
     found = devices.compute(lambda c, s: _validated(objective, c, s, task), controller, score)
     return float(found)
+
+
+@partial(jax.jit, static_argnames="task")
+def _standing(controller: Controller, task: Task) -> jax.Array:
+    return imperfect(controller, task, jax.random.key(STANDING_SEED), STANDING)[1].mean()
+
+
+def standing(controller: Controller, task: Task) -> float:
+    """The share of random imperfect scenarios in which a controller ends upright.
+
+    They stay the same, and are others than those that candidates are compared on.
+    """
+    return float(devices.compute(lambda c: _standing(c, task), controller))
 
 
 @pytree
@@ -144,6 +160,7 @@ class SearchStage(Stage[Controller, SearchState, Controller]):
         """
         kinds(policy, config.searched)
         self.config, self.policy, self.task = config, policy, task
+        self.objective = config.objective
         self.total = getattr(config, self.unit)  # the field is called like what it counts
 
     def prepared(self, controller: Controller) -> Controller:
@@ -182,7 +199,7 @@ class SearchStage(Stage[Controller, SearchState, Controller]):
     def compared(self, controller: Controller) -> tuple[float, float]:
         """The official score of a candidate, and what it is compared by."""
         score = float(self.task.score(nominal(controller, self.task)).mean())
-        return score, value(self.config.objective, controller, score, self.task)
+        return score, value(self.objective, controller, score, self.task)
 
     def rekey(self, state: SearchState, number: int) -> SearchState:
         key = jax.random.fold_in(state.search.key, number)

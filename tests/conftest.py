@@ -121,11 +121,11 @@ def task_of(robot: str) -> Task:
 
 
 def shipped_network(bias: float = 0.0):
-    """The network of the pendubot's policy that ships, unguarded, with more in its last bias."""
+    """The pendubot's demonstrated network, which sees one state, with more in its last bias."""
     from jaxpend import load_policy
     from jaxpend.controllers.policy import network_in
 
-    policy = network_in(load_policy("pendubot"))
+    policy = network_in(load_policy("demonstrated_pendubot"))
     *hidden, (kernel, last) = policy.layers
     return policy.replace(layers=(*hidden, (kernel, last + bias)))
 

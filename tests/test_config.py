@@ -303,7 +303,7 @@ def test_sections_of_other_commands_are_passed_over_only_where_said(tmp_path):
 
 def test_the_recipes_are_valid_for_every_training_command():
     robots = ("acrobot", "pendubot")
-    kinds = ("global_", "hardware_", "learned_")
+    kinds = ("demonstrated_", "global_", "hardware_")
     of_either = ["low_torque", "plain"]
     assert recipes() == sorted([*robots, *of_either, *(k + r for k in kinds for r in robots)])
     for name, kind in itertools.product(recipes(), (SACRun, SNESRun, TrainRun)):

@@ -24,6 +24,7 @@ from jaxpend.config import (
     SNESRun,
     TrainRun,
 )
+from jaxpend.config_files import load_config
 from jaxpend.gradient import Contest, Gradient
 from jaxpend.pytree import Pytree, pytree
 from jaxpend.report import page
@@ -33,6 +34,7 @@ from jaxpend.score import Criteria, nominal, score_v2
 from jaxpend.snes import SNES
 from jaxpend.train import train
 from jaxpend.train.interrupt import Stopped
+from jaxpend.train.loop import stages_of
 
 TASK = v2("pendubot").task
 
@@ -93,6 +95,13 @@ def test_the_best_policy_of_sac_is_that_of_its_objective(met):
     assert row["score"] == 0  # an untrained policy does not stand
     np.testing.assert_allclose([worth, row["value"]], 0.5 * 0.125, rtol=1e-6)
     assert met == [16]
+
+
+def test_every_stage_of_a_recipe_that_looks_at_scenarios_says_by_what_it_compares():
+    stages = stages_of(load_config(TrainRun(), "pendubot"), None, TASK)
+    assert list(stages) == ["sac", "openings", "gradient", "snes"]
+    assert all(found.objective.outcome == "success" for found in stages.values())
+    assert all(found.objective.weight for found in stages.values())
 
 
 # --- a new stage ---------------------------------------------------------------------------

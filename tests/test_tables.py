@@ -39,6 +39,16 @@ def test_results_without_a_later_criterion_have_an_empty_cell(capfd, narrow):
     assert ["Old", "0.500"] in lines
 
 
+def test_stages_that_look_at_scenarios_say_how_often_it_stands(capfd, narrow):
+    robust = STOOD | {"standing": {"before": 0.875, "after": 0.9521}}
+    tables.score_table({"after SAC": robust, "after SNES": STOOD}, v2("acrobot"))
+    said = capfd.readouterr().err
+    assert cells_of(said, "stands [%]") == ["87.5 → 95.2", ""]
+    assert max(map(len, said.splitlines())) <= 80
+    tables.score_table({"after SNES": STOOD}, v2("acrobot"))
+    assert "stands" not in capfd.readouterr().err
+
+
 def test_the_leaderboard_fits_80_columns(capfd, narrow):
     row = STOOD | {"title": "Policy, network + LQR", "source": "measured", "robustness": 0.5}
     row["robustness_criteria"] = dict.fromkeys(CRITERIA, 0.25)

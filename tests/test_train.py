@@ -18,13 +18,22 @@ from conftest import shipped_network
 from training_runs import OPTIONS, arrays_of, events_of, result_of, rows_of, training
 
 from jaxpend import Policy, cli, designs, load_policy, save_policy
+from jaxpend import stage as stage_module
 from jaxpend.boards import v2
-from jaxpend.config import GradientConfig, GradientRun, SACRun, SNESConfig, SNESRun, TrainRun
+from jaxpend.config import (
+    GradientConfig,
+    GradientRun,
+    Objective,
+    SACRun,
+    SNESConfig,
+    SNESRun,
+    TrainRun,
+)
 from jaxpend.controllers import Guarded, load_controller
 from jaxpend.controllers.catalogue import build
 from jaxpend.controllers.files import read_header
 from jaxpend.controllers.policy import network_in
-from jaxpend.score import official
+from jaxpend.score import imperfect, official
 from jaxpend.train.interrupt import Stopped
 from jaxpend.train.loop import stages_of, train
 
@@ -242,7 +251,11 @@ def test_the_gradient_has_a_place_between_sac_and_snes_where_it_has_steps():
 
 
 def test_snes_fine_tunes_any_controller_and_goes_on_where_it_was(monkeypatch, tmp_path):
-    snes = SNESConfig(generations=4, population=4, chunk=2, searched="gain", gain_sigma=0.3)
+    monkeypatch.setattr(stage_module, "STANDING", 40)
+    robust = Objective(0.5, "success", 24)
+    snes = SNESConfig(
+        generations=4, population=4, chunk=2, searched="gain", gain_sigma=0.3, objective=robust
+    )
     run = SNESRun(controller="tvlqr", runs=str(tmp_path), run="whole", snes=snes)
     result = train(run)
     assert result["score"] >= result["start"]["score"] > 0.7
@@ -252,6 +265,11 @@ def test_snes_fine_tunes_any_controller_and_goes_on_where_it_was(monkeypatch, tm
     np.testing.assert_array_equal(last.top.gain, start.top.gain)
     kept = load_controller(tmp_path / "whole" / "policy.npz")
     assert result["score"] == official(kept, "pendubot")["score"]
+    # How often it stood before and stands now, in scenarios that nothing was chosen by.
+    key = jax.random.key(stage_module.STANDING_SEED)
+    shares = [imperfect(c, TASK, key, 40)[1].mean() for c in (start, kept)]
+    np.testing.assert_allclose([*result["snes"]["standing"].values()], shares, atol=0.026)
+    assert stage_module.STANDING_SEED != stage_module.VALIDATION_SEED
     # Stopped between two chunks, and taken up again: the same to the bit.
     run = dataclasses.replace(run, run="stopped")
     calls = iter([None, Stopped(signal.SIGINT)])
@@ -264,7 +282,9 @@ def test_snes_fine_tunes_any_controller_and_goes_on_where_it_was(monkeypatch, tm
         patch.setattr("jaxpend.train.loop.stop_if_asked", stop)
         with pytest.raises(Stopped):
             train(run)
-    assert train(run)["score"] == result["score"]
+    again = train(run)
+    assert again["score"] == result["score"]
+    assert again["snes"]["standing"] == result["snes"]["standing"]
     for name in ("policy.npz", "snes_last.npz"):
         found = arrays_of(tmp_path / "stopped" / name)
         expected = arrays_of(tmp_path / "whole" / name)

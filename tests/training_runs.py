@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-RECIPE = "pendubot"
+RECIPE = "demonstrated_pendubot"
 OPTIONS = f"""
     --config {RECIPE} --seed 3 --run run --sac.steps 1024 --sac.eval-every 64 --sac.num-envs 8
     --sac.batch-size 32 --sac.replay-capacity 128 --sac.critic-hidden 8 --sac.actor-hidden 8

@@ -31,9 +31,9 @@ def in_numpy(policy: Policy, runs: int, steps: int) -> None:
 
 
 def main() -> list[dict]:
-    """The policy that ships, and two networks."""
+    """A guarded policy that imitates, and two networks."""
     rows, key = [], jax.random.key(0)
-    policies = {"as it ships, guarded": load_policy("pendubot")}
+    policies = {"imitated, guarded": load_policy("demonstrated_pendubot")}
     policies |= {f"2x{width}": measure.network(width) for width in (64, 256)}
     for name, policy in policies.items():
         ours = functools.partial(benchmark, policy, "pendubot", key, keys=1)

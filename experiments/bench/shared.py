@@ -2,7 +2,7 @@
 
     python experiments/bench/shared.py
 
-Wall clock, all cores: 722 runs of the shipped policy, a generation of SNES, and a step of the
+Wall clock, all cores: 722 runs of a guarded policy, a generation of SNES, and a step of the
 gradient with scenarios, on one device and on all of them.
 """
 
@@ -23,14 +23,14 @@ from jaxpend.robustness import benchmark
 
 def main() -> list[dict]:
     """Three kinds of work on one and on all devices."""
-    task, shipped, rows = v2("pendubot").task, load_policy("pendubot"), []
-    network = network_in(shipped)
+    task, policy, rows = v2("pendubot").task, load_policy("demonstrated_pendubot"), []
+    network = network_in(policy)
     search = snes.SNES(SNESConfig(generations=1, chunk=1), network, task)
     config = GradientConfig(steps=5, chunk=5, scenarios=16, objective=Objective(0.5))
     ascent = gradient.Gradient(config, network, task)
     begun = search.start(0, network), ascent.start(0, network)
     work = {
-        "722 runs": lambda: benchmark(shipped, task.plant, jax.random.key(0), keys=1).overall,
+        "722 runs": lambda: benchmark(policy, task.plant, jax.random.key(0), keys=1).overall,
         "a generation of SNES": lambda: search.advance([begun[0]])[0][1],
         "5 steps of the gradient": lambda: ascent.advance([begun[1]])[0][1],
     }

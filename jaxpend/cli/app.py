@@ -33,7 +33,7 @@ class Command:
 COMMANDS = {
     "train": Command(
         "train a policy",
-        "imitation, SAC and SNES by a recipe; ends with the official score",
+        "SAC, the gradient and SNES, as a recipe says; ends with the official score",
         "--config pendubot --seed 1",
     ),
     "sac": Command("train a policy", "SAC on the surrogate reward", "--config pendubot --seed 1"),

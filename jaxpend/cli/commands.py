@@ -23,10 +23,10 @@ from .output import ARRAYS, JSON, MARKDOWN, check_file, check_folder, emit, emit
 
 
 def train(config: TrainRun, command: str) -> None:
-    """Imitation, SAC and SNES by a recipe; ends with the official score.
+    """The stages of training that a recipe has; ends with the official score.
 
-    Imitation comes where the configuration has demonstrations; between SAC and SNES come other
-    ways to begin, where it has a count of openings, and the gradient, where it has steps.
+    They are imitation, where it has demonstrations; SAC; other ways to begin, where it has a count
+    of openings; the gradient, where it has steps; SNES, where it has generations.
     """
     execute(config, command)
 
@@ -89,7 +89,7 @@ def report(
 
     Args:
         run: a run folder, finished or not, a folder of seeds, a policy or controller file, or
-            acrobot or pendubot for the policy that ships with the package.
+            the name of a policy that ships with the package, such as acrobot.
         controller: as in jaxpend score: a known one, which is judged around the policy of RUN, or
             module:name with the classes that its file needs. Where RUN is a robot, any one.
         out: folder for report.html and report/*.png; by default the run folder, or else

@@ -31,8 +31,8 @@ def export(
     A controller that loops, such as MPC, is refused.
 
     Args:
-        policy: a policy or controller file, or acrobot or pendubot for the policy that ships with
-            the package.
+        policy: a policy or controller file, or the name of a policy that ships with the package,
+            such as acrobot.
         to: numpy, a Python file with a class; onnx, a model with its memory as inputs and outputs;
             c, a header without allocation; realaigym, a submission to its boards in numpy, with
             what they measure, which takes a while.

@@ -48,7 +48,13 @@ def score_table(results: Mapping[str, Mapping], board: "Board") -> None:
         heading, unit, form, _ = HEADINGS[name]
         cells = (_criterion(result, name, form) for result in results.values())
         table.add_row(f"{heading} [{unit}]", *cells)
+    robust = any("standing" in result for result in results.values())
+    if robust:
+        table.add_row("stands [%]", *map(_standing, results.values()))
     console.print(table)
+    if robust:
+        text = "stands: in 1024 random scenarios, what a stage began with → ended with"
+        console.print(f"{text}; SNES begins behind the guard", style="dim")
     if board.published:
         published = ", ".join(f"{title} {score:.3f}" for title, score, _ in board.published)
         console.print(f"published: {published}", style="dim")
@@ -60,6 +66,12 @@ def _criterion(result: Mapping[str, Any], name: str, form: str) -> str:
         return "-"
     value = result["criteria"].get(name)
     return "" if value is None else format(value, form)
+
+
+def _standing(result: Mapping[str, Any]) -> str:
+    """Before and after a stage."""
+    found = result.get("standing")
+    return f"{100 * found['before']:.1f} → {100 * found['after']:.1f}" if found else ""
 
 
 def robustness_table(result: Mapping[str, Any], board: "Board") -> None:

@@ -191,12 +191,12 @@ def read_header(robot_or_path: str | Path) -> dict[str, Any]:
 def load_controller(
     robot_or_path: str | Path, *, robot: str | None = None, classes: Iterable[type] = ()
 ) -> Controller:
-    """Load a policy or controller file, or by a robot's name the policy that ships.
+    """Load a policy or controller file, or by its name a policy that ships (``robots.SHIPPED``).
 
     The arrays have jax's default float type at the time of the call.
 
     Args:
-        robot_or_path: a path, or the name of a robot.
+        robot_or_path: a path, or a name in ``robots.SHIPPED``.
         robot: the robot that it must be for; None accepts either.
         classes: a user's own, beside the package's.
 
@@ -234,8 +234,8 @@ def load_controller(
 def load_policy(robot_or_path: str | Path, *, robot: str | None = None) -> Startable:
     """``load_controller`` of the package's own classes: a ``Policy``, or a ``Guarded`` around it.
 
-    "acrobot" and "pendubot" are the policies that ship with the package. From a loop of your own
-    they are called with ``policy.start().torque(x)``. Raises ``JaxpendError`` as
-    ``load_controller``.
+    "acrobot" and "pendubot" are what ``make train`` has learned, "demonstrated_acrobot" what its
+    recipe of that name has; ``robots.SHIPPED`` has them all. From a loop of your own they are
+    called with ``policy.start().torque(x)``. Raises ``JaxpendError`` as ``load_controller``.
     """
     return cast(Startable, load_controller(robot_or_path, robot=robot))

@@ -104,6 +104,7 @@ class SAC(Stage[SACState | None, SACState, Controller]):
 
     def __init__(self, config: SACConfig, task: Task):
         self.agent, self.task, self.total = Agent(config, task), task, config.steps
+        self.objective = config.objective
         self.vector_steps = chunk_length(
             -(-config.steps // config.num_envs), max(config.eval_every // config.num_envs, 1)
         )
@@ -147,7 +148,7 @@ class SAC(Stage[SACState | None, SACState, Controller]):
         policy = algorithm.greedy_policy(self.agent, state)
         c = nominal(policy, self.task)
         score = float(self.task.score(c).mean())
-        worth = value(self.agent.config.objective, policy, score, self.task)
+        worth = value(self.objective, policy, score, self.task)
         row = {"updates": int(state.updates), "score": score, "uptime": c.uptime.mean(), **metrics}
         return row | {"value": worth}, [(policy, worth)]
 
@@ -181,6 +182,7 @@ class Contestants(Stage[SACState | None, ContestantsState, tuple[Controller, ...
 
     def __init__(self, config: SACConfig, task: Task):
         self.inner, self.agent, self.total = SAC(config, task), Agent(config, task), config.steps
+        self.objective = config.objective
 
     def _unjudged(self, sac: SACState) -> ContestantsState:
         count = self.agent.config.contestants

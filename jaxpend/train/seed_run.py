@@ -15,7 +15,7 @@ from ..pytree import Pytree
 from ..runs.checkpoints import Checkpoints
 from ..runs.folder import RunFolder
 from ..score import official
-from ..stage import Candidates, Stage
+from ..stage import Candidates, Stage, standing
 from ..terminal import console
 
 __all__ = ["SeedRun", "all_finite"]
@@ -37,12 +37,15 @@ class SeedRun:
     best_at: int = 0
     rollbacks: int = 0
     stage_began: float = 0.0  # s since the run began
+    stood: float = 0.0  # ``stage.standing`` of what the stage began with, where that counts
     result: dict = dataclasses.field(default_factory=dict)
     failed: str = ""  # why it cannot go on
     saved: float = 0.0  # s since the run began, when the last checkpoint was written
 
     # What of it goes into the JSON part of a checkpoint.
-    PLAIN: ClassVar = ("stage", "best_score", "best_at", "rollbacks", "stage_began", "result")
+    PLAIN: ClassVar = (
+        "stage", "best_score", "best_at", "rollbacks", "stage_began", "stood", "result",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         keep = self.config.checkpoint.keep
@@ -68,7 +71,7 @@ class SeedRun:
         self.folder.rewind(about["metrics_bytes"], about["seconds"])
         self.state, self.best, self.saved = arrays["state"], arrays["best"], about["seconds"]
         for name in self.PLAIN:
-            setattr(self, name, about[name])
+            setattr(self, name, about.get(name, getattr(self, name)))
         stage = stages[self.stage]
         if self.best is not None:
             self._save("best", stage, self.best, self.best_at)  # the file may be of a later time
@@ -94,6 +97,8 @@ class SeedRun:
         self.stage, self.best, self.best_score, self.best_at = stage.name, None, -math.inf, 0
         row, candidates = stage.judge(self.state, {})
         self._keep_best(stage, candidates)
+        if candidates and stage.objective.weight:
+            self.stood = standing(candidates[0][0], self.board.task)
         if "score" in row:  # a point to begin the curves with
             self.folder.log(stage.name, **{stage.column: stage.done(self.state)}, **row)
 
@@ -140,8 +145,11 @@ class SeedRun:
         if self.best is not None:
             now = self.folder.seconds
             seconds = round(now - self.stage_began, 1)
-            self.result[stage.name] = official(self.best, self.board) | {"seconds": seconds}
-            self.result["score"] = self.result[stage.name]["score"]
+            result = official(self.best, self.board) | {"seconds": seconds}
+            if stage.objective.weight:
+                after = standing(self.best, self.board.task)
+                result["standing"] = {"before": self.stood, "after": after}
+            self.result[stage.name], self.result["score"] = result, result["score"]
             self.stage_began = now
         self.outcome = stage.outcome(self.state, self.best)
 
