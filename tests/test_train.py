@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import shipped_network
+from conftest import refused, shipped_network
 from training_runs import OPTIONS, arrays_of, events_of, result_of, rows_of, training
 
-from jaxpend import Policy, cli, designs, load_policy, save_policy
+from jaxpend import Policy, cli, designs, hosts, load_policy, save_policy
 from jaxpend import stage as stage_module
 from jaxpend.boards import v2
 from jaxpend.config import (
@@ -291,6 +291,21 @@ def test_snes_fine_tunes_any_controller_and_goes_on_where_it_was(monkeypatch, tm
         assert found.keys() == expected.keys()
         for key, value in expected.items():
             np.testing.assert_array_equal(found[key], value)
+
+
+def test_a_host_that_is_gone_between_two_chunks_leaves_everything_on_disk(monkeypatch, tmp_path):
+    snes = SNESConfig(generations=4, population=4, chunk=2, searched="gain", gain_sigma=0.3)
+    run = SNESRun(controller="tvlqr", runs=str(tmp_path), run="run", snes=snes)
+    calls = iter([None, hosts.Gone("another host is gone")])
+
+    def agreed(agreed):
+        if (now := next(calls, None)) is not None:
+            raise now
+
+    monkeypatch.setattr("jaxpend.train.loop.stop_if_asked", agreed)
+    with refused("another host is gone; everything is in"):
+        train(run)
+    assert list((tmp_path / "run" / "checkpoints").glob("*.npz"))
 
 
 def one_sentence(err):

@@ -52,29 +52,27 @@ def train_stage(stage: Stage, runs: Sequence[SeedRun]) -> None:
         for run in runs:
             if run.stage != stage.name:
                 run.enter(stage)
-        while behind := running():
-            try:
+        try:
+            while behind := running():
                 stop_if_asked(hosts.agreed)
-            except Stopped as stop:
-                for run in behind:
-                    run.checkpoint()
-                raise Stopped(stop.signum, f"stopped {behind[0].where(stage)}") from None
-            least = min(stage.done(run.state) for run in behind)
-            group = [run for run in behind if stage.done(run.state) == least]
-            before = runs[0].best_score
-            try:
+                least = min(stage.done(run.state) for run in behind)
+                group = [run for run in behind if stage.done(run.state) == least]
+                before = runs[0].best_score
                 after = stage.advance([run.state for run in group])
                 rows = [run.take(stage, *done) for run, done in zip(group, after, strict=True)]
-            except hosts.Gone:
-                for run in behind:
-                    run.checkpoint()
-                raise
-            if any(r.folder.seconds - r.saved >= r.config.checkpoint.every for r in group):
-                for run in running():
-                    run.checkpoint()
-            note = stage.note(rows[0]) if len(runs) == 1 else f"{len(group)} seeds"
-            note += best_so_far(stage, runs, before)
-            progress.report(min(stage.done(group[0].state), stage.total), note)
+                if any(r.folder.seconds - r.saved >= r.config.checkpoint.every for r in group):
+                    for run in running():
+                        run.checkpoint()
+                note = stage.note(rows[0]) if len(runs) == 1 else f"{len(group)} seeds"
+                note += best_so_far(stage, runs, before)
+                progress.report(min(stage.done(group[0].state), stage.total), note)
+        except (Stopped, hosts.Gone) as end:
+            for run in running():
+                run.checkpoint()
+            if isinstance(end, Stopped):
+                where = running()[0].where(stage)
+                raise Stopped(end.signum, f"stopped {where}") from None
+            raise
     for run in runs:
         if not run.failed:
             run.leave(stage)
