@@ -37,6 +37,7 @@ ACTIVATIONS: tuple[str, ...] = get_args(Activation)
 Strategy = Literal["snes", "sep_cma_es", "lm_ma_es", "open_es"]
 Duration = Annotated[float, Bounds(least=0.01, most=3600)]  # s
 PositiveOrInfinite = Annotated[float, Bounds(above=0, infinite=True)]
+Rate = Annotated[float, Bounds(above=0, most=1)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,8 +116,7 @@ class DemonstrationConfig(Checked):
     action_noise: NotNegative = 0.3  # largest standard deviation, of the normalised action
     kicks: NotNegative = 0.1  # rad/s, largest standard deviation of velocity jumps between steps
     pulses: NotNegative = 0.0  # strength of disturbance pulses; 1 is the robustness benchmark's
-    # rad and rad/s, largest standard deviation of the initial state.
-    start_spread: NotNegative = 0.1
+    start_spread: NotNegative = 0.1  # rad and rad/s, largest standard deviation of the start
     delay: NotNegative = 0.0  # s, of measurements, up to which the shown balance would hold
     updates: Count = 20_000  # imitation updates of the actor before SAC
     batch_size: Count = 1024
@@ -138,10 +138,8 @@ class SACConfig(Checked):
     warmup_steps: Natural = 5_000  # environment steps with uniform actions before learning
     discount: Annotated[float, Bounds(above=0, below=1)] = 0.99
     n_step: Annotated[int, Bounds(least=1, most=100)] = 1  # rewards before a target bootstraps
-    # Polyak averaging of the target critics.
-    target_rate: Annotated[float, Bounds(above=0, most=1)] = 0.005
-    # The same of the actor, whose average is the greedy policy; 1: it is the actor itself.
-    average_rate: Annotated[float, Bounds(above=0, most=1)] = 1.0
+    target_rate: Rate = 0.005  # Polyak averaging of the target critics
+    average_rate: Rate = 1.0  # the same of the actor, whose average is the greedy policy; 1: none
     learning_rate: Positive = 1e-3
     final_learning_rate: Positive = 1.0  # cosine decay to this fraction of learning_rate
     target_entropy: float = -1.0  # nats
@@ -151,6 +149,9 @@ class SACConfig(Checked):
     critic_hidden: tuple[Count, ...] = (128, 128)
     activation: Activation = "relu"
     critic_layer_norm: bool = False
+    # Of a distribution of the return, between these values; 0: critics of the mean alone.
+    critic_bins: Natural = 0
+    critic_range: tuple[float, float] = (-100.0, 150.0)
     demonstrations: DemonstrationConfig = dataclasses.field(default_factory=DemonstrationConfig)
     imitation: NotNegative = 0.0  # weight of the squared distance to the demonstrated actions
     actor_delay: Natural = 0  # environment steps before the actor learns; the critics start at once
@@ -161,6 +162,10 @@ class SACConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.critic_bins == 1:
+            raise JaxpendError("critic_bins is 1; it must be 0 or at least 2")
+        if self.critic_range[0] >= self.critic_range[1]:
+            raise JaxpendError(f"critic_range is {self.critic_range}; the first must be lower")
         if self.replay_capacity < self.num_envs * self.n_step:
             text = f"it must hold n_step = {self.n_step} steps of all {self.num_envs} environments"
             raise JaxpendError(f"replay_capacity is {self.replay_capacity}; {text}")
@@ -260,11 +265,9 @@ class GradientConfig(Checked):
     scenario_duration: Duration = 4.0  # s
     objective: Objective = dataclasses.field(default_factory=Objective)
     memory: PositiveOrInfinite = 1.0  # s, with which their gradient fades back; inf: it does not
-    # Weight of the squared distance to the start's own actions in scenarios in which it stands.
-    retention: NotNegative = 0.0
+    retention: NotNegative = 0.0  # weight of the squared distance to the start's where it stands
     retained_after: NotNegative = 2.0  # s, into a run; the swing-up before is free to change
-    # By how much the worth may fall below the best before the ascent goes back there.
-    tolerance: PositiveOrInfinite = 0.02
+    tolerance: PositiveOrInfinite = 0.02  # less worth than the best: the ascent goes back there
     chunk: Count = 20  # steps per report
 
     def __post_init__(self) -> None:
@@ -278,15 +281,13 @@ class Run(Checked):
 
     robot: Robot = "pendubot"
     board: BoardName = "v2"  # whose task it is; v3: of global policies; hardware: of real robots
-    # How the robots of the hardware board differ, see jaxpend.hardware.
-    preset: Preset = "identified"
+    preset: Preset = "identified"  # how robots of the hardware board differ: jaxpend.hardware
     plant: str = ""  # file of the parameters of another plant; empty: that of the boards
     design: str = ""  # or an identified one by name, such as C.1/1.0
     seed: Seed = 0
     # How many runs, of the seeds from ``seed`` on, each in RUN/seedN.
     seeds: Annotated[int, Bounds(above=0, most=1000)] = 1
-    # Several seeds in one computation; auto: on an accelerator.
-    vmap: Literal["auto", "yes", "no"] = "auto"
+    vmap: Literal["auto", "yes", "no"] = "auto"  # seeds in one computation; auto: on a GPU or TPU
     # How many GPUs, or cores of a processor, share rollouts; 0: all. The cores share the steps of
     # SAC too where the number is given.
     devices: Natural = 0
@@ -300,8 +301,7 @@ class Run(Checked):
     run: str = ""
     runs: str = "runs"  # folder of the run folders
     checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
-    # rollback: back to the last chunk, on with another key.
-    on_divergence: Literal["stop", "rollback"] = "stop"
+    on_divergence: Literal["stop", "rollback"] = "stop"  # or go on from before, another key
     max_rollbacks: Natural = 3  # in a run, before it stops after all
     tensorboard: bool = False  # the metrics as TensorBoard events too, in RUN/tensorboard
 

@@ -3,15 +3,20 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from conftest import assert_close, both_robots
+from hypothesis import given
+from hypothesis import strategies as st
 
 from jaxpend.boards import v2
 from jaxpend.designs import active_joint
 from jaxpend.env import Env, EnvConfig
 from jaxpend.observation import Observation
-from jaxpend.sac.critics import TwinCritic
+from jaxpend.sac.critics import HistogramCritic, TwinCritic
+from jaxpend.sac.losses import histogram
 from jaxpend.sac.networks import Actor, constant_log_std, sample_action, to_policy
+from jaxpend.sac.replay import Transition
 
 STATES = np.random.default_rng(0).normal(size=(5, 4)).astype("f4") * [1, 2, 4, 8]
 OBS, BEFORE = np.split(np.random.default_rng(1).normal(size=(5, 7)).astype("f4"), [6], axis=1)
@@ -114,6 +119,56 @@ def test_critics_are_two_and_see_everything_and_the_lower_counts(layer_norm):
     np.testing.assert_array_equal(moved[:, 1], q[:, 1])
     assert np.all(moved[:, 0] != q[:, 0])
     assert ("LayerNorm_0" in params["params"]["Trunk_0"]) == layer_norm
+
+
+def test_distributional_critics_are_two_and_their_means_lie_between_the_ends():
+    critic = HistogramCritic((8,), "relu", True, 11, (-2.0, 3.0))
+    params = critic.init(jax.random.key(0), OBS, BEFORE, ACTIONS)
+    now = (params, OBS, BEFORE, ACTIONS)
+    logits = jax.jit(critic.logits)(*now)
+    assert logits.shape == (5, 2, 11)
+    means = critic.means(logits)
+    np.testing.assert_allclose(jax.jit(critic.value)(*now), means.min(axis=-1), rtol=1e-5)
+    assert not np.allclose(means[:, 0], means[:, 1])
+    # All in one bin: its middle.
+    middles = np.linspace(-2, 3, 12)[:-1] + 2.5 / 11
+    sure = critic.means(jnp.where(jnp.eye(11, dtype=bool), 100.0, 0.0))
+    np.testing.assert_allclose(sure, middles, rtol=1e-4, atol=1e-5)
+
+
+@given(st.floats(-50, 50), st.integers(2, 60))
+def test_a_histogram_of_a_target_is_a_distribution_about_it(target, bins):
+    edges = jnp.linspace(-10.0, 10.0, bins + 1)
+    (share,) = histogram(jnp.asarray([target]), edges)
+    assert share.min() >= 0
+    np.testing.assert_allclose(share.sum(), 1, atol=1e-5)
+    width = 20 / bins
+    if abs(target) < 10 - 3 * width:  # the whole bell is between the ends
+        mean = share @ ((edges[1:] + edges[:-1]) / 2)
+        np.testing.assert_allclose(mean, target, atol=0.05 * width)
+    if abs(target) > 10:
+        assert share.argmax() == (bins - 1 if target > 0 else 0)
+
+
+def test_distributional_critics_learn_the_soft_target():
+    critic = HistogramCritic((32,), "relu", True, 51, (-4.0, 4.0))
+    params = critic.init(jax.random.key(0), OBS, BEFORE, ACTIONS)
+    one = Transition(OBS, BEFORE, ACTIONS, jnp.arange(-2.0, 3.0), OBS, BEFORE)
+    optimizer, cost = optax.adam(1e-2), jnp.full(5, 0.5)
+
+    @jax.jit
+    def step(params, state):
+        (loss, _), slope = jax.value_and_grad(critic.loss, has_aux=True)(
+            params, params, one, ACTIONS, cost, 0.0
+        )
+        updates, state = optimizer.update(slope, state)
+        return optax.apply_updates(params, updates), state, loss
+
+    state = optimizer.init(params)
+    for _ in range(400):
+        params, state, _ = step(params, state)
+    found = critic.means(critic.logits(params, OBS, BEFORE, ACTIONS))
+    np.testing.assert_allclose(found, np.arange(-2.0, 3.0)[:, None] * [1, 1], atol=0.1)
 
 
 @both_robots

@@ -107,6 +107,7 @@ def probing(advance, episode_steps=8, max_speed=math.inf, **options):
 
 VALUE = probing(stay, discount=0.8, init_temperature=0.5, actor_delay=10**9)
 CREDIT = probing(credit, discount=0.9, init_temperature=0.02, target_entropy=-2.0)
+BINS = {"critic_bins": 51, "critic_layer_norm": True}
 REPLAY = probing(
     drift, episode_steps=5, max_speed=3.5, num_envs=4, replay_capacity=15, warmup_steps=8,
     reward_scale=0.5,
@@ -140,19 +141,21 @@ def solved():
     return sac.train_chunk(CREDIT, sac.init(CREDIT, KEY), 300)
 
 
-def test_values_bootstrap_through_the_time_limit_with_the_entropy_on_top():
-    state = sac.init(VALUE, KEY)
+@pytest.mark.parametrize("bins", [{}, BINS | {"critic_range": (-4.0, 12.0)}])
+def test_values_bootstrap_through_the_time_limit_with_the_entropy_on_top(bins):
+    agent = changed(VALUE, **bins)
+    state = sac.init(agent, KEY)
     actor = jax.tree.map(jnp.zeros_like, state.actor)  # tanh(N(0, 1)) everywhere
     state = state.replace(actor=actor)
     start = jax.tree.map(jnp.copy, (state.actor, state.log_temperature, state.critic))
-    state, metrics = sac.train_chunk(VALUE, state, 400)
+    state, metrics = sac.train_chunk(agent, state, 400)
     v = np.linspace(-8, 8, 4001)
     density = np.exp(-(v**2) / 2) / np.sqrt(2 * np.pi)
     entropy = np.trapezoid(-density * (np.log(density) - np.log(1 - np.tanh(v) ** 2)), v)
     np.testing.assert_allclose(metrics["entropy"], entropy, atol=0.02)
     x = np.zeros((9, 4), "f4")
     x[:, 0] = np.linspace(-0.6, 0.6, 9)
-    q = VALUE.critic.both(state.critic, x, np.zeros((9, 1), "f4"), np.zeros(9, "f4"))
+    q = agent.critic.both(state.critic, x, np.zeros((9, 1), "f4"), np.zeros(9, "f4"))
     expected = (1 + x[:, :1] + 0.8 * 0.5 * entropy) / (1 - 0.8)
     np.testing.assert_allclose(q, np.repeat(expected, 2, axis=1), atol=0.6)
     np.testing.assert_allclose(q.mean(), expected.mean(), atol=0.25)
@@ -161,8 +164,12 @@ def test_values_bootstrap_through_the_time_limit_with_the_entropy_on_top():
     assert not leaves_equal(state.critic, start[2])
 
 
-def test_actions_are_paid_for_now_and_one_step_later(solved):
+@pytest.mark.parametrize("bins", [{}, BINS | {"critic_range": (-10.0, 2.0)}])
+def test_actions_are_paid_for_now_and_one_step_later(solved, bins):
     state, _ = solved
+    if bins:
+        agent = changed(CREDIT, **bins)
+        state, _ = sac.train_chunk(agent, sac.init(agent, KEY), 300)
     early = greedy(CREDIT, state, [[-0.5, 0, 0, 0]])
     assert early[0] > 0.6
     late = greedy(CREDIT, state, [[0.5, a, 0, 0] for a in (0.7, 0.9)])
@@ -477,6 +484,10 @@ def test_learning_rate_decays_over_the_whole_run():
             "n_step is 2; with demonstrations it must be 1",
         ),
         ({"activation": "exp"}, "activation is 'exp'; it must be relu, tanh or silu"),
+        ({"critic_bins": 1}, "critic_bins is 1; it must be 0 or at least 2"),
+        ({"critic_bins": -1}, "critic_bins is -1; it must not be negative"),
+        ({"critic_range": (1.0, 1.0)}, "critic_range is (1.0, 1.0); the first must be lower"),
+        ({"critic_range": (0.0, math.inf)}, "critic_range"),
     ],
 )
 def test_senseless_values_are_one_sentence(values, words):

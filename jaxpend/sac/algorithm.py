@@ -19,7 +19,7 @@ from ..env import Env, EnvState, restarted, truncated
 from ..pytree import Pytree, pytree
 from ..task import Task
 from . import losses, replay
-from .critics import Critic, TwinCritic
+from .critics import Critic, HistogramCritic, TwinCritic
 from .demonstrations import Imitation, imitate, imitation, swingups
 from .networks import Actor, Params, act, constant_log_std, to_policy
 from .replay import Replay, Transition
@@ -64,7 +64,10 @@ class Agent:
     def critic(self) -> Critic:
         """What judges actions."""
         config = self.config
-        return TwinCritic(config.critic_hidden, config.activation, config.critic_layer_norm)
+        form = (config.critic_hidden, config.activation, config.critic_layer_norm)
+        if config.critic_bins:
+            return HistogramCritic(*form, config.critic_bins, config.critic_range)
+        return TwinCritic(*form)
 
     @cached_property
     def optimizer(self) -> optax.GradientTransformation:

@@ -3,13 +3,15 @@
 import dataclasses
 from typing import Protocol, cast
 
+import jax
+import jax.numpy as jnp
 from jax import Array
 
 from . import losses
 from .networks import Params, Twins
 from .replay import Transition
 
-__all__ = ["Critic", "TwinCritic"]
+__all__ = ["Critic", "HistogramCritic", "TwinCritic"]
 
 
 class Critic(Protocol):
@@ -48,7 +50,7 @@ class TwinCritic:
 
     def both(self, params: Params, obs: Array, privileged: Array, action: Array) -> Array:
         """Both values (..., 2)."""
-        return cast(Array, self.network.apply(params, obs, privileged, action))
+        return cast(Array, self.network.apply(params, obs, privileged, action))[..., 0]
 
     def init(self, key, obs, privileged, action):
         return self.network.init(key, obs, privileged, action)
@@ -62,3 +64,53 @@ class TwinCritic:
         goal = losses.soft_target(batch.reward, next_value, next_cost, discount)
         q = self.both(params, batch.obs, batch.privileged, batch.action)
         return losses.squared_error(q, goal), q.mean()
+
+
+@dataclasses.dataclass(frozen=True)
+class HistogramCritic:
+    """Two independent distributions of the return over bins, of which the lower mean counts.
+
+    They are learned as classes are, by cross-entropy (Farebrother et al., "Stop regressing", 2024).
+    """
+
+    hidden: tuple[int, ...]
+    activation: str
+    layer_norm: bool
+    bins: int
+    range: tuple[float, float]  # of returns; beyond it they are taken to be at its ends
+
+    @property
+    def network(self) -> Twins:
+        """The logits of both distributions."""
+        return Twins(self.hidden, self.activation, self.layer_norm, self.bins)
+
+    @property
+    def edges(self) -> Array:
+        """Of the bins, (bins + 1,)."""
+        return jnp.linspace(*self.range, self.bins + 1)
+
+    def means(self, logits: Array) -> Array:
+        """Means (..., 2) of distributions (..., 2, bins)."""
+        return jax.nn.softmax(logits) @ ((self.edges[1:] + self.edges[:-1]) / 2)
+
+    def logits(self, params: Params, obs: Array, privileged: Array, action: Array) -> Array:
+        """Of both distributions, (..., 2, bins)."""
+        return cast(Array, self.network.apply(params, obs, privileged, action))
+
+    def both(self, params: Params, obs: Array, privileged: Array, action: Array) -> Array:
+        """The means of both, (..., 2)."""
+        return self.means(self.logits(params, obs, privileged, action))
+
+    def init(self, key, obs, privileged, action):
+        return self.network.init(key, obs, privileged, action)
+
+    def value(self, params, obs, privileged, action):
+        return self.both(params, obs, privileged, action).min(axis=-1)
+
+    def loss(self, params, target, batch, next_action, next_cost, discount):
+        """The cross-entropy of both distributions with one about the soft target."""
+        next_value = self.value(target, batch.next_obs, batch.next_privileged, next_action)
+        goal = losses.soft_target(batch.reward, next_value, next_cost, discount)
+        logits = self.logits(params, batch.obs, batch.privileged, batch.action)
+        loss = losses.cross_entropy(logits, losses.histogram(goal, self.edges))
+        return loss, self.means(logits).mean()

@@ -1,10 +1,15 @@
 """What SAC minimises (Haarnoja et al., 2018, arXiv 1812.05905); n is the size of a batch."""
 
 import chex
+import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.scipy.stats import norm
 
-__all__ = ["actor", "imitation", "soft_target", "squared_error", "temperature_slope"]
+__all__ = [
+    "actor", "cross_entropy", "histogram", "imitation", "soft_target", "squared_error",
+    "temperature_slope",
+]  # fmt: skip
 
 
 def soft_target(
@@ -27,6 +32,25 @@ def squared_error(values: Array, target: Array) -> Array:
     chex.assert_rank((values, target), (2, 1))
     # mean_ij (Q_j(s_i, a_i) - y_i)^2
     return jnp.mean((values - target[:, None]) ** 2)
+
+
+def histogram(target: Array, edges: Array) -> Array:
+    """What each bin has (n, bins) of a normal distribution about a target (n,), all in all 1.
+
+    ``edges`` are (bins + 1,), evenly spaced; the standard deviation is 0.75 bins, a target beyond
+    the edges is at the edge (HL-Gauss: Imani and White, 2018; Farebrother et al., 2024).
+    """
+    chex.assert_rank((target, edges), 1)
+    spread = 0.75 * (edges[1] - edges[0])
+    target = jnp.clip(target, edges[0], edges[-1])
+    below = norm.cdf(edges, target[:, None], spread)
+    return jnp.diff(below, axis=-1) / (below[:, -1:] - below[:, :1])
+
+
+def cross_entropy(logits: Array, target: Array) -> Array:
+    """Mean cross-entropy of logits (n, critics, bins) with their common target (n, bins)."""
+    chex.assert_rank((logits, target), (3, 2))
+    return -jnp.sum(target[:, None] * jax.nn.log_softmax(logits), axis=-1).mean()
 
 
 def actor(value: Array, cost: Array) -> Array:

@@ -61,16 +61,17 @@ class Twins(nn.Module):
     hidden: Sequence[int]
     activation: str
     layer_norm: bool
+    outputs: int = 1
 
     @nn.compact
     def __call__(self, obs: Array, privileged: Array, action: Array) -> Array:
-        """Action values (..., 2) of what is seen and actions (...,)."""
+        """Outputs (..., 2, outputs) of what is seen and actions (...,)."""
         inputs = jnp.concatenate([obs, privileged, action[..., None]], axis=-1)
         values = []
         for _ in range(2):
             h = Trunk(self.hidden, self.activation, self.layer_norm)(inputs)
-            values.append(nn.Dense(1)(h))
-        return jnp.concatenate(values, axis=-1)
+            values.append(nn.Dense(self.outputs)(h))
+        return jnp.stack(values, axis=-2)
 
 
 def sample_action(mean: Array, log_std: Array, key: Array) -> tuple[Array, Array]:
