@@ -136,7 +136,7 @@ def test_distributional_critics_are_two_and_their_means_lie_between_the_ends():
     np.testing.assert_allclose(sure, middles, rtol=1e-4, atol=1e-5)
 
 
-@given(st.floats(-50, 50), st.integers(2, 60))
+@given(st.floats(-50, 50), st.sampled_from([2, 11, 60]))
 def test_a_histogram_of_a_target_is_a_distribution_about_it(target, bins):
     edges = jnp.linspace(-10.0, 10.0, bins + 1)
     (share,) = histogram(jnp.asarray([target]), edges)
