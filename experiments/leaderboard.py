@@ -57,9 +57,11 @@ def main(
             row |= leaderboard.judge(make, v2(robot), **options)
             boards = merged(path, robot, row)
             cli.emit_json(boards, path)
-            for known, board in boards.items():
-                board["columns"] = v2(known).columns
-            tables = [(r, leaderboard.markdown(boards[r])) for r in designs.ROBOTS if r in boards]
+            tables = [
+                (r, leaderboard.markdown(boards[r] | {"columns": v2(r).columns}))
+                for r in designs.ROBOTS
+                if r in boards
+            ]
             text = "\n".join(f"## {r}\n\n{table}" for r, table in tables)
             write_atomically(path.with_suffix(".md"), intro + text)
 

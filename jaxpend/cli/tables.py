@@ -53,7 +53,7 @@ def score_table(results: Mapping[str, Mapping], board: "Board") -> None:
         table.add_row("stands [%]", *map(_standing, results.values()))
     console.print(table)
     if robust:
-        text = "stands: in 1024 random scenarios, what a stage began with → ended with"
+        text = "stands: in random scenarios, what a stage began with → ended with"
         console.print(f"{text}; SNES begins behind the guard", style="dim")
     if board.published:
         published = ", ".join(f"{title} {score:.3f}" for title, score, _ in board.published)

@@ -67,17 +67,14 @@ class TwinCritic:
 
 
 @dataclasses.dataclass(frozen=True)
-class HistogramCritic:
+class HistogramCritic(TwinCritic):
     """Two independent distributions of the return over bins, of which the lower mean counts.
 
     They are learned as classes are, by cross-entropy (Farebrother et al., "Stop regressing", 2024).
     """
 
-    hidden: tuple[int, ...]
-    activation: str
-    layer_norm: bool
-    bins: int
-    range: tuple[float, float]  # of returns; beyond it they are taken to be at its ends
+    bins: int = 101
+    range: tuple[float, float] = (-100.0, 150.0)  # of returns, which are cut off at its ends
 
     @property
     def network(self) -> Twins:
@@ -89,23 +86,17 @@ class HistogramCritic:
         """Of the bins, (bins + 1,)."""
         return jnp.linspace(*self.range, self.bins + 1)
 
-    def means(self, logits: Array) -> Array:
-        """Means (..., 2) of distributions (..., 2, bins)."""
-        return jax.nn.softmax(logits) @ ((self.edges[1:] + self.edges[:-1]) / 2)
-
     def logits(self, params: Params, obs: Array, privileged: Array, action: Array) -> Array:
         """Of both distributions, (..., 2, bins)."""
         return cast(Array, self.network.apply(params, obs, privileged, action))
 
+    def means(self, logits: Array) -> Array:
+        """Means (..., 2) of distributions (..., 2, bins)."""
+        return jax.nn.softmax(logits) @ ((self.edges[1:] + self.edges[:-1]) / 2)
+
     def both(self, params: Params, obs: Array, privileged: Array, action: Array) -> Array:
         """The means of both, (..., 2)."""
         return self.means(self.logits(params, obs, privileged, action))
-
-    def init(self, key, obs, privileged, action):
-        return self.network.init(key, obs, privileged, action)
-
-    def value(self, params, obs, privileged, action):
-        return self.both(params, obs, privileged, action).min(axis=-1)
 
     def loss(self, params, target, batch, next_action, next_cost, discount):
         """The cross-entropy of both distributions with one about the soft target."""

@@ -43,6 +43,7 @@ def histogram(target: Array, edges: Array) -> Array:
     chex.assert_rank((target, edges), 1)
     spread = 0.75 * (edges[1] - edges[0])
     target = jnp.clip(target, edges[0], edges[-1])
+    # p_b = (F(e_b+1) - F(e_b)) / (F(e_n) - F(e_0)), F the distribution function of N(y, spread^2)
     below = norm.cdf(edges, target[:, None], spread)
     return jnp.diff(below, axis=-1) / (below[:, -1:] - below[:, :1])
 
@@ -50,6 +51,7 @@ def histogram(target: Array, edges: Array) -> Array:
 def cross_entropy(logits: Array, target: Array) -> Array:
     """Mean cross-entropy of logits (n, critics, bins) with their common target (n, bins)."""
     chex.assert_rank((logits, target), (3, 2))
+    # -mean_ij sum_b p_b(y_i) log softmax(l_j)_b
     return -jnp.sum(target[:, None] * jax.nn.log_softmax(logits), axis=-1).mean()
 
 
