@@ -85,6 +85,13 @@ def test_noise_does_not_fill_an_axis(axes):
     assert high - low == pytest.approx(0.007, rel=0.02)
 
 
+@pytest.mark.parametrize("y", [[0.0, 0.0], [0.0, 0.1]])
+def test_a_logarithmic_axis_needs_something_positive(axes, y):
+    curves.draw_curves(axes, "Loss", {"loss": [(np.arange(2), np.array(y))]}, xlabel="x", log=True)
+    axes.figure.canvas.draw()
+    assert axes.get_yscale() == ("log" if max(y) > 0 else "linear")
+
+
 def test_a_page_recolours_charts_and_keeps_their_ids_apart():
     def draw(axes):
         axes.plot([0, 1], color=plots.PALETTE["one"])

@@ -210,7 +210,8 @@ def draw_curves(
             axes.fill_between(common, low, high, color=PALETTE[colour], alpha=0.22, linewidth=0)
             mean = interquartile_mean(ys)
             axes.plot(common, mean, color=PALETTE[colour], linewidth=2.6, label=label)
-    if log:
+    positive = any(np.any(y > 0) for seeds in curves.values() for _, y in seeds)
+    if log and positive:
         _log_axis(axes)
     else:
         _calm(axes)
