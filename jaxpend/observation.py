@@ -11,7 +11,9 @@ from .fields import Bounds, Checked, Positive, Scale
 if TYPE_CHECKING:
     import jax
 
-__all__ = ["KINDS", "Observation"]
+__all__ = ["KINDS", "History", "Observation"]
+
+History = Annotated[int, Bounds(least=0, most=1000)]
 
 
 def _wrapped(x: jax.Array, max_velocity: float) -> jax.Array:
@@ -89,7 +91,7 @@ class Observation(Checked):
     kind: Literal["wrapped", "sincos", "sincos_clipped", "state", "angles"] = "sincos"
     max_velocity: Scale = 20.0  # rad/s, velocities are divided by it
     # Past states and actions that are seen too, one control period apart.
-    history: Annotated[int, Bounds(least=0, most=1000)] = 0
+    history: History = 0
     mean: tuple[float, ...] | None = None  # of what is seen of a state; None: 0
     std: tuple[Scale, ...] | None = None  # standard deviations; None: 1
     clip: Positive | None = None  # largest magnitude of what is seen, once normalised; None: any

@@ -27,6 +27,7 @@ from jaxpend.env import Env, EnvConfig
 from jaxpend.fields import hints_of, split
 from jaxpend.interop.stable_baselines3 import PRESETS, SEEN, Convention, declared, read_model
 from jaxpend.interop.tensors import StateDict
+from jaxpend.observation import Observation
 from jaxpend.snes import SNESConfig, best_controller, evolve, init
 
 STATES = np.random.default_rng(1).normal(size=(50, 4)) * [4, 4, 30, 30]
@@ -187,6 +188,22 @@ def test_what_our_own_environments_show_is_a_preset(tmp_path):
     assert policy.torque_limit == env.config.torque_limit
     # Options go before a preset.
     assert declared(path, "gymnasium", torque_limit=6.0).torque_limit == 6.0
+
+
+@pytest.mark.parametrize("kind", ["sincos", "angles"])
+def test_memory_is_that_of_our_own_environments(here, monkeypatch, capsys, kind):
+    shown = {"kind": kind, "max_velocity": 5.0, "history": 2, "max_turn": 0.2}
+    env = Env(EnvConfig(dt=0.02, observation=Observation(**shown)), v2("pendubot").task)
+    start = env.reset(jax.random.key(0))
+    layers = layers_of(len(start.obs), 8, 1)
+    sb3_files.model(here / "m.zip", network(layers, "SAC"))
+    line = f"m.zip --robot pendubot --preset gymnasium --observation {kind} --max-velocity 5"
+    line += " --history 2 --control-dt 0.02 --max-turn 0.2 --out p.npz"
+    assert run(monkeypatch, capsys, "import", *line.split())[0] == 0
+    policy = load_policy(here / "p.npz")
+    assert (policy.observation, policy.control_dt) == (env.config.observation, env.config.dt)
+    torque = policy(policy.reset(jax.random.key(0)), 0.0, start.x)[1][0]
+    assert_close(torque, 3 * np.tanh(mean_action(layers, "relu", np.asarray(start.obs))), times=1e3)
 
 
 def test_the_options_are_those_of_the_convention():
@@ -385,6 +402,19 @@ def test_what_is_no_plain_actor_is_one_sentence(here, monkeypatch, capsys, case)
      " is 1e+39; it must be at most 1,000,000,000"),
     ("model.zip --robot acrobot --preset evolsac --max-velocity 1e-46 --out p.npz", "--max-velocity"
      " is 1e-46; it must be at least 1e-09"),
+    ("model.zip --robot acrobot --preset evolsac --history 2 --out p.npz", "history is 2; declare "
+     "control_dt, its period, too"),
+    ("model.zip --robot acrobot --preset evolsac --history -1 --out p.npz", "--history is -1; it "),
+    ("model.zip --robot acrobot --preset evolsac --history 2 --control-dt 0 --out p.npz",
+     "--control-dt is 0.0; it must be positive"),
+    ("model.zip --robot acrobot --preset evolsac --history 2 --control-dt 0.02 --out p.npz",
+     "model.zip: its network sees 4 numbers, 'wrapped' with history 2 is 14; declare"),
+    ("model.zip --robot acrobot --preset evolsac --history 2 --control-dt 0.02 --statistics s.npz "
+     "--out p.npz", "history is 2; with running statistics it must be 0"),
+    ("model.zip --robot acrobot --preset evolsac --observation sincos_by_joint --history 2 "
+     "--control-dt 0.02 --out p.npz", "history is 2; with observation 'sincos_by_joint' it must"),
+    ("model.zip --robot acrobot --preset evolsac --observation angles --out p.npz",
+     "model.zip: history is 0; angles are seen without velocities"),
     ("model.zip --robot acrobot --preset evolsac", "--out is missing; see jaxpend import --help"),
     ("--robot acrobot --preset evolsac --out p.npz", "MODEL is missing"),
     ("model.zip --robot acrobot --preset evolsac --out -", "--out is -; a policy file cannot"),

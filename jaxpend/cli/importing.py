@@ -5,12 +5,13 @@ from typing import Literal
 
 from ..config import Activation
 from ..errors import JaxpendError
-from ..fields import Robot, Scale
+from ..fields import Positive, Robot, Scale
+from ..observation import History
 from .output import check_file
 
 __all__ = ["import_"]
 
-Seen = Literal["wrapped", "sincos", "sincos_clipped", "sincos_by_joint", "state"]
+Seen = Literal["wrapped", "sincos", "sincos_clipped", "sincos_by_joint", "state", "angles"]
 
 
 def import_(
@@ -26,6 +27,9 @@ def import_(
     statistics: Path | None = None,
     squash: Literal["tanh", "clip"] | None = None,
     activation: Activation | None = None,
+    history: History | None = None,
+    control_dt: Positive | None = None,
+    max_turn: Scale | None = None,
 ) -> None:
     """A policy file of a Stable-Baselines3 model, SAC or PPO, which every command takes.
 
@@ -39,12 +43,16 @@ def import_(
         observation: what it saw. wrapped: angles mod 2 pi, scaled to [-1, 1], and clipped
             velocities; sincos: both cosines, both sines, velocities; sincos_clipped: the same
             with clipped velocities; sincos_by_joint: that with cosine and sine of the first joint
-            first; state: angles in rad, velocities.
+            first; state: angles in rad, velocities; angles: cosines and sines alone.
         max_velocity: rad/s, by which velocities were divided; 1 if they were not.
         torque_limit: N m, the torque at the largest action.
         statistics: what VecNormalize.save wrote, or a .npz of mean and var.
         squash: how the mean becomes an action; by default tanh in SAC, clip in PPO.
         activation: by default what the model says.
+        history: past states and actions that it saw too, as our own environments show them.
+        control_dt: s, how far apart they are.
+        max_turn: rad, by which our own environments divided how far a joint turned in a period,
+            with angles.
     """
     _check_out(out)
     from ..controllers.files import save_policy
@@ -53,7 +61,8 @@ def import_(
 
     convention = declared(
         model, preset, observation=observation, max_velocity=max_velocity, squash=squash,
-        torque_limit=torque_limit, activation=activation,
+        torque_limit=torque_limit, activation=activation, history=history, control_dt=control_dt,
+        max_turn=max_turn,
         statistics=None if statistics is None else str(statistics),
     )  # fmt: skip
     found = read_model(model, robot, convention)

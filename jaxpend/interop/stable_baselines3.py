@@ -21,8 +21,8 @@ import numpy as np
 from ..config import Activation, EnvConfig
 from ..controllers.policy import Policy
 from ..errors import JaxpendError, choose
-from ..fields import Checked, Scale
-from ..observation import Observation
+from ..fields import Checked, Positive, Scale
+from ..observation import History, Observation
 from ..robots import ROBOTS
 from .tensors import MOST_PICKLE, MOST_TENSORS, Name, StateDict, array, description, member, shown
 
@@ -43,6 +43,7 @@ SEEN: dict[str, tuple[str, tuple[int, ...] | None]] = {
     "sincos_clipped": ("sincos_clipped", None),
     "sincos_by_joint": ("sincos_clipped", (0, 2, 1, 3, 4, 5)),
     "state": ("state", None),
+    "angles": ("angles", None),
 }
 # The layers that act, hidden ones and the last, and all that a file with them may hold besides.
 ACTORS = {
@@ -66,15 +67,31 @@ class Convention(Checked):
     ``wrapped`` is (theta mod 2 pi - pi) / pi of both angles and clipped velocities,
     ``sincos`` (cos theta1, cos theta2, sin theta1, sin theta2) and velocities,
     ``sincos_clipped`` the same with clipped velocities, ``sincos_by_joint`` the same in the order
-    (cos theta1, sin theta1, cos theta2, sin theta2), ``state`` angles as they are and velocities.
+    (cos theta1, sin theta1, cos theta2, sin theta2), ``state`` angles as they are and velocities,
+    ``angles`` cosines and sines alone. What was seen of the past is as ``Observation`` has it.
     """
 
-    observation: Literal["wrapped", "sincos", "sincos_clipped", "sincos_by_joint", "state"]
+    observation: Literal[
+        "wrapped", "sincos", "sincos_clipped", "sincos_by_joint", "state", "angles"
+    ]
     max_velocity: Scale  # rad/s, velocities are divided by it, and clipped there if clipped
     torque_limit: Scale  # N m, torque at the largest action
     statistics: str | None = None  # file, see ``read_statistics``; None: it does not normalise
     squash: Literal["tanh", "clip"] | None = None  # of the mean action; None: as the library does
     activation: Activation | None = None  # None: as the zip says
+    history: History = 0  # past states and actions that it sees too
+    control_dt: Positive | None = None  # s, how far apart they are
+    max_turn: Scale = 0.1  # rad, what ``angles`` sees of the past is divided by it
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.history:
+            return
+        if self.control_dt is None:
+            raise JaxpendError(f"history is {self.history}; declare control_dt, its period, too")
+        if self.statistics or SEEN[self.observation][1]:
+            what = "running statistics" if self.statistics else f"observation {self.observation!r}"
+            raise JaxpendError(f"history is {self.history}; with {what} it must be 0")
 
 
 # What the authors of published policies declared: the form of the observation in gym_env.py of the
@@ -202,10 +219,17 @@ def _policy(
         raise JaxpendError("its observation is not one vector of numbers, a Box")
     keywords = options.get("policy_kwargs") or {}
     kind, order = SEEN[convention.observation]
-    view = Observation(kind, convention.max_velocity)  # type: ignore[arg-type]
+    view = Observation(
+        kind,  # type: ignore[arg-type]
+        convention.max_velocity,
+        convention.history,
+        max_turn=convention.max_turn,
+    )
     kernel, (last, last_bias) = layers[0][0], layers[-1]
     if len(kernel) != view.size:
-        said = f"its network sees {len(kernel)} numbers, {convention.observation!r} is {view.size}"
+        past = f" with history {convention.history}" if convention.history else ""
+        said = f"its network sees {len(kernel)} numbers, {convention.observation!r}{past}"
+        said += f" is {view.size}"
         raise JaxpendError(f"{said}; declare the observation that it was trained with")
     if len(last_bias) != 1:
         raise JaxpendError(f"it has {len(last_bias)} actions; one is read, of the driven joint")
@@ -216,7 +240,7 @@ def _policy(
         layers[-1] = last / bound, last_bias / bound
     if order is not None:
         layers[0] = layers[0][0][list(order)], layers[0][1]
-    return Policy(
+    policy = Policy(
         layers=tuple((jnp.asarray(w), jnp.asarray(b)) for w, b in layers),
         torque_limit=jnp.asarray(convention.torque_limit, jnp.float32),
         robot=robot,
@@ -224,6 +248,8 @@ def _policy(
         activation=_activation(keywords, algorithm, convention),
         squash=squash,
     )
+    period = convention.control_dt
+    return policy if period is None else policy.replace(control_dt=period)
 
 
 def _normalised(policy: Policy, convention: Convention, statistics: "Statistics") -> Policy:
