@@ -144,14 +144,14 @@ class SACConfig(Checked):
     final_learning_rate: Positive = 1.0  # cosine decay to this fraction of learning_rate
     target_entropy: float = -1.0  # nats
     init_temperature: Positive = 0.1
+    noise_repeat: Annotated[float, Bounds(least=1, most=1000)] = 1.0  # mean steps it lasts
     reward_scale: Positive = 0.1
     actor_hidden: tuple[Count, ...] = (128, 128)
     critic_hidden: tuple[Count, ...] = (128, 128)
     activation: Activation = "relu"
     critic_layer_norm: bool = False
-    # Of a distribution of the return, between these values; 0: critics of the mean alone.
-    critic_bins: Natural = 0
-    critic_range: tuple[float, float] = (-100.0, 150.0)
+    critic_bins: Natural = 0  # of a distribution of the return; 0: critics of its mean alone
+    critic_range: tuple[float, float] = (-100.0, 150.0)  # of scaled returns, from first to last bin
     demonstrations: DemonstrationConfig = dataclasses.field(default_factory=DemonstrationConfig)
     imitation: NotNegative = 0.0  # weight of the squared distance to the demonstrated actions
     actor_delay: Natural = 0  # environment steps before the actor learns; the critics start at once

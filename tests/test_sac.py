@@ -354,6 +354,21 @@ def test_episodes_end_by_time_and_by_speed_and_start_anew():
     assert len(set(starts)) == len(starts) > 8  # a fresh key at every reset
 
 
+def test_exploration_noise_is_held_for_some_steps():
+    agent = changed(CREDIT, num_envs=512, noise_repeat=4.0)
+    state, held = sac.init(agent, KEY), []
+    for key in jax.random.split(KEY, 6):
+        before, (state, _) = state, interact(agent, state, key)
+        held.append(np.mean(state.noise == before.noise))
+        mean, log_std = agent.actor.apply(before.actor, before.envs.obs)
+        drawn = columns(state.replay.data)[int(before.replay.position)][:, -1]
+        assert_close(drawn, np.tanh(mean + np.exp(log_std) * state.noise)[:, 0])
+    # Of 512 each; it begins at 0, with nothing to hold on to.
+    np.testing.assert_allclose(held, 0.75, atol=4 * math.sqrt(0.75 * 0.25 / 512))
+    np.testing.assert_allclose([state.noise.mean(), state.noise.std()], [0, 1], atol=0.3)
+    assert sac.init(CREDIT, KEY).noise is None  # new in every step
+
+
 def test_the_greedy_policy_is_that_of_the_averaged_actor():
     agent = sac.Agent(small(env=EnvConfig(), average_rate=0.25), TASK)
     state = sac.init(agent, KEY)
@@ -484,6 +499,7 @@ def test_learning_rate_decays_over_the_whole_run():
             "n_step is 2; with demonstrations it must be 1",
         ),
         ({"activation": "exp"}, "activation is 'exp'; it must be relu, tanh or silu"),
+        ({"noise_repeat": 0.5}, "noise_repeat is 0.5; it must be at least 1"),
         ({"critic_bins": 1}, "critic_bins is 1; it must be 0 or at least 2"),
         ({"critic_bins": -1}, "critic_bins is -1; it must not be negative"),
         ({"critic_range": (1.0, 1.0)}, "critic_range is (1.0, 1.0); the first must be lower"),

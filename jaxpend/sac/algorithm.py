@@ -21,7 +21,7 @@ from ..task import Task
 from . import losses, replay
 from .critics import Critic, HistogramCritic, TwinCritic
 from .demonstrations import Imitation, imitate, imitation, swingups
-from .networks import Actor, Params, act, constant_log_std, to_policy
+from .networks import Actor, Params, act, constant_log_std, spread, squashed, to_policy
 from .replay import Replay, Transition
 
 __all__ = [
@@ -96,6 +96,7 @@ class SACState(Pytree):
     key: jax.Array
     env_steps: jax.Array  # () int
     updates: jax.Array  # () int
+    noise: jax.Array | None = None  # (num_envs, 1) of exploration, with ``config.noise_repeat``
     average: Params | None = None  # of the actor, with ``config.average_rate``
 
 
@@ -185,6 +186,7 @@ def _fresh(agent: Agent, key: jax.Array) -> SACState:
         key=key,
         env_steps=zero,
         updates=zero,
+        noise=jnp.zeros((config.num_envs, 1)) if config.noise_repeat > 1 else None,
         average=jax.tree.map(jnp.copy, actor) if config.average_rate < 1 else None,
     )
 
@@ -251,7 +253,15 @@ def interact(agent: Agent, state: SACState, key: jax.Array) -> tuple[SACState, j
     """
     config, env, before = agent.config, agent.env, state.envs
     key_action, key_uniform, key_reset = jax.random.split(key, 3)
-    action, _ = act(agent.actor, state.actor, before.obs, key_action)
+    mean, log_std = spread(agent.actor, state.actor, before.obs)
+    noise = jax.random.normal(key_action, mean.shape, mean.dtype)
+    if state.noise is not None:
+        # A step of exploration is short: what lasts for some moves the arm (Hollenstein et al.,
+        # "Action noise in off-policy deep reinforcement learning", 2022).
+        again = jax.random.uniform(jax.random.fold_in(key_action, 1), noise.shape)
+        noise = jnp.where(again * config.noise_repeat < 1, noise, state.noise)
+        state = state.replace(noise=noise)
+    action, _ = squashed(mean, log_std, noise)
     uniform = jax.random.uniform(key_uniform, action.shape, minval=-1.0, maxval=1.0)
     action = jnp.where(state.env_steps < config.warmup_steps, uniform, action)
     after = devices.split(jax.vmap(env.step))(before, action)

@@ -11,7 +11,9 @@ from jax import Array
 from ..controllers.policy import ACTIVATIONS, Policy
 from ..env import Env
 
-__all__ = ["Actor", "Params", "Twins", "act", "constant_log_std", "sample_action", "to_policy"]
+__all__ = [
+    "Actor", "Params", "Twins", "act", "constant_log_std", "spread", "squashed", "to_policy",
+]  # fmt: skip
 
 LOG_STD_RANGE = (-10.0, 2.0)
 
@@ -74,24 +76,31 @@ class Twins(nn.Module):
         return jnp.stack(values, axis=-2)
 
 
-def sample_action(mean: Array, log_std: Array, key: Array) -> tuple[Array, Array]:
-    """Sample tanh(N(mean, std)) for a mean and a logarithm of std (..., 1), as of ``Actor``.
+def squashed(mean: Array, log_std: Array, noise: Array) -> tuple[Array, Array]:
+    """tanh(mean + std noise) for a mean and a logarithm of std (..., 1), as of ``Actor``.
 
-    Returns the action (...,) and its log-probability (...,), computed from the sample before the
-    tanh with ``log(1 - tanh(v)^2) = 2 (log 2 - v - softplus(-2 v))`` (Haarnoja et al., 2018,
-    appendix C). ``key`` is consumed.
+    ``noise`` (..., 1) is standard normal. Returns the action (...,) and its log-probability
+    (...,), computed from the sample before the tanh with
+    ``log(1 - tanh(v)^2) = 2 (log 2 - v - softplus(-2 v))`` (Haarnoja et al., 2018, appendix C).
     """
-    noise = jax.random.normal(key, mean.shape, mean.dtype)
     v = mean + jnp.exp(log_std) * noise
     log_prob = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
     log_prob = log_prob - 2 * (jnp.log(2.0) - v - jax.nn.softplus(-2 * v))
     return jnp.tanh(v)[..., 0], log_prob[..., 0]
 
 
+def spread(actor: Actor, params: Params, obs: Array) -> tuple[Array, Array]:
+    """Mean and log standard deviation (..., 1) of an ``Actor`` for observations (..., obs_size)."""
+    return cast(tuple[Array, Array], actor.apply(params, obs))
+
+
 def act(actor: Actor, params: Params, obs: Array, key: Array) -> tuple[Array, Array]:
-    """``sample_action`` for observations (..., obs_size)."""
-    mean, log_std = cast(tuple[Array, Array], actor.apply(params, obs))
-    return sample_action(mean, log_std, key)
+    """A random action and its log-probability, as ``squashed``, for observations (..., obs_size).
+
+    ``key`` is consumed.
+    """
+    mean, log_std = spread(actor, params, obs)
+    return squashed(mean, log_std, jax.random.normal(key, mean.shape, mean.dtype))
 
 
 def constant_log_std(actor_params: Params, log_std: float) -> Params:
