@@ -35,7 +35,8 @@ def table(found: dict) -> str:
             ratio = row["speed"] / first.setdefault(row["part"], row["speed"])
             seconds = f"{row['processor']:.4f} s ({row['low']:.4f} to {row['high']:.4f})"
             cells = [row["part"], row["way"], f"{row['speed']:.3g} {row['unit']}/s", f"{ratio:.2f}"]
-            cells += [seconds, f"{row['wall']:.4f} s", f"{row['compile']:.1f} s"]
+            compiled = "in it" if row["compile"] is None else f"{row['compile']:.1f} s"
+            cells += [seconds, f"{row['wall']:.4f} s", compiled]
             lines.append(f"| {' | '.join(cells)} |")
     machines = {name: part["machine"] for name, part in found.items()}
     for name, about in machines.items():
