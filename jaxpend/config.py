@@ -144,7 +144,7 @@ class SACConfig(Checked):
     final_learning_rate: Positive = 1.0  # cosine decay to this fraction of learning_rate
     target_entropy: float = -1.0  # nats
     init_temperature: Positive = 0.1
-    noise_repeat: Annotated[float, Bounds(least=1, most=1000)] = 1.0  # mean steps it lasts
+    noise_repeat: Annotated[float, Bounds(least=1, most=999)] = 1.0  # steps exploration noise lasts
     reward_scale: Positive = 0.1
     actor_hidden: tuple[Count, ...] = (128, 128)
     critic_hidden: tuple[Count, ...] = (128, 128)
