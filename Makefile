@@ -84,7 +84,7 @@ lint: $(STAMP)  ## ruff: rules and format; mypy: types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(STAMP)  ## time every part on this machine, beside other ways to do it (20 minutes)
+bench: $(STAMP)  ## time every part on this machine, beside other ways to do it (half an hour)
 	$(BIN)/python experiments/bench $(ARGS)
 
 clean:  ## remove the virtual environment and caches; runs/ stays

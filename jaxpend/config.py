@@ -18,6 +18,7 @@ from .fields import (
     Count,
     Natural,
     NotNegative,
+    Period,
     Positive,
     Preset,
     Robot,
@@ -74,7 +75,7 @@ class EnvConfig(Checked):
     """The learning environment."""
 
     torque_limit: Positive = 3.0  # N m, torque at action 1
-    dt: Positive = 0.01  # s, control period
+    dt: Period = 0.01  # s, control period
     duration: Duration = 10.0  # s, then the episode is truncated
     observation: Observation = dataclasses.field(default_factory=Observation)
     reward: Reward = dataclasses.field(default_factory=Reward)
@@ -84,8 +85,7 @@ class EnvConfig(Checked):
     # Share that starts anywhere: uniform angles, velocities with a standard deviation of 5 rad/s.
     random_starts: Share = 0.0
     thrown_starts: Share = 0.0  # share of episodes that start as a reset by hand leaves the arm
-    # Share of episodes in a random scenario, see ``variations``; of the hardware task all are,
-    # where it is not 0, and a share of the robots is pushed.
+    # Share of episodes in a random scenario; of the hardware task, if not 0, all, some pushed.
     randomised: Share = 0.0
 
     def __post_init__(self) -> None:
@@ -144,7 +144,7 @@ class SACConfig(Checked):
     final_learning_rate: Positive = 1.0  # cosine decay to this fraction of learning_rate
     target_entropy: float = -1.0  # nats
     init_temperature: Positive = 0.1
-    noise_repeat: Annotated[float, Bounds(least=1, most=999)] = 1.0  # steps exploration noise lasts
+    noise_repeat: Annotated[float, Bounds(least=1, most=100)] = 1.0  # steps exploration noise lasts
     reward_scale: Positive = 0.1
     actor_hidden: tuple[Count, ...] = (128, 128)
     critic_hidden: tuple[Count, ...] = (128, 128)

@@ -26,12 +26,14 @@ __all__ = [
     "LARGEST",
     "OFF",
     "ON",
+    "SLOWEST",
     "BoardName",
     "Bounds",
     "Checked",
     "Count",
     "Natural",
     "NotNegative",
+    "Period",
     "Positive",
     "Preset",
     "Robot",
@@ -80,6 +82,8 @@ Positive = Annotated[float, Bounds(above=0)]
 NotNegative = Annotated[float, Bounds(least=0)]
 # Of what is multiplied with float32 numbers, which would be infinite or 0 where it is beyond them.
 Scale = Annotated[float, Bounds(above=0, least=1e-9, most=1e9)]
+SLOWEST = 1.0  # s, the longest control period of a policy
+Period = Annotated[float, Bounds(above=0, most=SLOWEST)]
 Share = Annotated[float, Bounds(least=0, most=1)]
 # Keys of jax are made of 32 bits; the largest seed is for scenarios that no run trains on.
 Seed = Annotated[int, Bounds(least=0, below=LARGEST)]

@@ -105,7 +105,9 @@ def test_every_text_is_free_or_one_of_a_few():
             lambda: SACConfig(demonstrations=DemonstrationConfig(1, 0.01), env=EnvConfig(dt=0.02)),
             "demonstrations.duration is 0.01; it must not be shorter than env.dt",
         ),
-        (lambda: EnvConfig(dt=11.0), "dt is 11.0; it must not be longer than an episode"),
+        (lambda: EnvConfig(dt=0.5, duration=0.4), "dt is 0.5; it must not be longer than an e"),
+        # No policy file says so long a period.
+        (lambda: EnvConfig(dt=1.5), "dt is 1.5; it must be at most 1"),
         (lambda: EnvConfig(randomised=1.5), "randomised is 1.5; it must be at most 1"),
         (lambda: EnvConfig(upright_starts=-0.1), "it must not be negative"),
         (lambda: Reward(floor=math.inf), "floor is inf; it must be at most 0"),

@@ -407,6 +407,8 @@ def test_what_is_no_plain_actor_is_one_sentence(here, monkeypatch, capsys, case)
     ("model.zip --robot acrobot --preset evolsac --history -1 --out p.npz", "--history is -1; it "),
     ("model.zip --robot acrobot --preset evolsac --history 2 --control-dt 0 --out p.npz",
      "--control-dt is 0.0; it must be positive"),
+    *((f"model.zip --robot acrobot --preset evolsac --history 2 --control-dt {dt} --out p.npz",
+       "--control-dt is") for dt in ("3.7", "1e9", "nan")),
     ("model.zip --robot acrobot --preset evolsac --history 2 --control-dt 0.02 --out p.npz",
      "model.zip: its network sees 4 numbers, 'wrapped' with history 2 is 14; declare"),
     ("model.zip --robot acrobot --preset evolsac --history 2 --control-dt 0.02 --statistics s.npz "

@@ -1,8 +1,7 @@
 """All parts of the benchmark, each in a process of its own: ``python experiments/bench``.
 
 It prints what each part prints, and writes bench.json, bench.md and bench.png beside this folder.
-``--parts steps updates`` runs these alone, and keeps what bench.json has of the others;
-``--parts learning`` is not among them, since it takes half an hour.
+``--parts steps updates`` runs these alone, and keeps what bench.json has of the others.
 """
 
 import argparse
@@ -17,8 +16,7 @@ import numpy as np
 from jaxpend.files import write_atomically
 
 HERE = Path(__file__).parent
-PARTS = ("steps", "generation", "robustness", "updates", "shared", "mpc", "growth")
-LONG = ("learning",)  # half an hour by itself
+PARTS = ("steps", "generation", "robustness", "updates", "shared", "mpc", "growth", "learning")
 CURVES = {
     "number of rollouts": "rollouts in one vmap", "width": "width of both hidden layers",
     "horizon, s": "horizon, s", "seeds of SAC": "seeds of SAC in one vmap",
@@ -29,7 +27,7 @@ def table(found: dict) -> str:
     """All rows as Markdown."""
     lines = ["| part | | speed | of the first | processor (lowest to highest) | wall | compiled |"]
     lines.append("|---|---|---|---|---|---|---|")
-    for name in (*PARTS, *LONG):
+    for name in PARTS:
         first = {}
         for row in found.get(name, {"rows": []})["rows"]:
             ratio = row["speed"] / first.setdefault(row["part"], row["speed"])
@@ -80,7 +78,7 @@ def picture(found: dict, path: Path) -> None:
 def main() -> None:
     """Run the parts, and keep what they say."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--parts", nargs="+", default=PARTS, choices=(*PARTS, *LONG))
+    parser.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS)
     kept = HERE.parent / "bench.json"
     found = json.loads(kept.read_text()) if kept.exists() else {}
     for name in parser.parse_args().parts:

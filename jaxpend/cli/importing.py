@@ -5,7 +5,7 @@ from typing import Literal
 
 from ..config import Activation
 from ..errors import JaxpendError
-from ..fields import Positive, Robot, Scale
+from ..fields import Period, Robot, Scale
 from ..observation import History
 from .output import check_file
 
@@ -28,7 +28,7 @@ def import_(
     squash: Literal["tanh", "clip"] | None = None,
     activation: Activation | None = None,
     history: History | None = None,
-    control_dt: Positive | None = None,
+    control_dt: Period | None = None,
     max_turn: Scale | None = None,
 ) -> None:
     """A policy file of a Stable-Baselines3 model, SAC or PPO, which every command takes.

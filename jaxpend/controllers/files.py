@@ -19,6 +19,7 @@ import numpy as np
 from ..arrays import read_arrays, write_arrays
 from ..controller import Controller, OpenLoop, Zero, check_controller, robot_of
 from ..errors import JaxpendError, choose
+from ..fields import SLOWEST
 from ..observation import Observation
 from ..plant import Plant
 from ..robots import ROBOTS, shipped
@@ -46,7 +47,6 @@ CLASSES = (
     EnergyShaping, Ellipsoid, Guarded, Hybrid, KalmanFilter, LQR, MPC, Observation, Observer,
     OpenLoop, PD, Plant, Policy, Reference, Rescue, Riccati, Solution, TVLQR, Tolerances, Zero,
 )  # fmt: skip
-SLOWEST = 1.0  # s, the longest control period that a policy may say it was trained at
 
 
 def classes_of(value: Any) -> set[type]:

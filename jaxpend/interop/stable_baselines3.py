@@ -21,7 +21,7 @@ import numpy as np
 from ..config import Activation, EnvConfig
 from ..controllers.policy import Policy
 from ..errors import JaxpendError, choose
-from ..fields import Checked, Positive, Scale
+from ..fields import Checked, Period, Scale
 from ..observation import History, Observation
 from ..robots import ROBOTS
 from .tensors import MOST_PICKLE, MOST_TENSORS, Name, StateDict, array, description, member, shown
@@ -80,7 +80,7 @@ class Convention(Checked):
     squash: Literal["tanh", "clip"] | None = None  # of the mean action; None: as the library does
     activation: Activation | None = None  # None: as the zip says
     history: History = 0  # past states and actions that it sees too
-    control_dt: Positive | None = None  # s, how far apart they are
+    control_dt: Period | None = None  # s, how far apart they are
     max_turn: Scale = 0.1  # rad, what ``angles`` sees of the past is divided by it
 
     def __post_init__(self) -> None:

@@ -21,7 +21,7 @@ from ..task import Task
 from . import losses, replay
 from .critics import Critic, HistogramCritic, TwinCritic
 from .demonstrations import Imitation, imitate, imitation, swingups
-from .networks import Actor, Params, act, constant_log_std, spread, squashed, to_policy
+from .networks import Actor, Params, act, constant_log_std, distribution, squashed, to_policy
 from .replay import Replay, Transition
 
 __all__ = [
@@ -96,7 +96,7 @@ class SACState(Pytree):
     key: jax.Array
     env_steps: jax.Array  # () int
     updates: jax.Array  # () int
-    noise: jax.Array | None = None  # (num_envs, 1) of exploration, with ``config.noise_repeat``
+    noise: jax.Array | None = None  # (num_envs, 1) of exploration, where it is to last
     average: Params | None = None  # of the actor, with ``config.average_rate``
 
 
@@ -253,13 +253,14 @@ def interact(agent: Agent, state: SACState, key: jax.Array) -> tuple[SACState, j
     """
     config, env, before = agent.config, agent.env, state.envs
     key_action, key_uniform, key_reset = jax.random.split(key, 3)
-    mean, log_std = spread(agent.actor, state.actor, before.obs)
+    mean, log_std = distribution(agent.actor, state.actor, before.obs)
     noise = jax.random.normal(key_action, mean.shape, mean.dtype)
     if state.noise is not None:
-        # A step of exploration is short: what lasts for some moves the arm (Hollenstein et al.,
+        # Noise of one step hardly moves the arm, noise that lasts does (Hollenstein et al.,
         # "Action noise in off-policy deep reinforcement learning", 2022).
-        again = jax.random.uniform(jax.random.fold_in(key_action, 1), noise.shape)
-        noise = jnp.where(again * config.noise_repeat < 1, noise, state.noise)
+        key_anew, share = jax.random.fold_in(key_action, 1), 1 / config.noise_repeat
+        anew = jax.random.bernoulli(key_anew, share, noise.shape)
+        noise = jnp.where(anew, noise, state.noise)
         state = state.replace(noise=noise)
     action, _ = squashed(mean, log_std, noise)
     uniform = jax.random.uniform(key_uniform, action.shape, minval=-1.0, maxval=1.0)

@@ -46,7 +46,7 @@ def histogram(target: Array, edges: Array) -> Array:
     spread = 0.75 * (edges[1] - edges[0])
     target = jnp.clip(target, edges[0], edges[-1])
     # p_b = (F(e_b+1) - F(e_b)) / (F(e_n) - F(e_0)), F(e) = erf((e - y) / (sqrt(2) spread)): the
-    # distribution function of N(y, spread^2) but for factors that cancel, and a sixth of its time.
+    # distribution function of N(y, spread^2) but for factors that cancel, and faster.
     below = erf((edges - target[:, None]) / (math.sqrt(2) * spread))
     return jnp.diff(below, axis=-1) / (below[:, -1:] - below[:, :1])
 

@@ -12,7 +12,7 @@ from ..controllers.policy import ACTIVATIONS, Policy
 from ..env import Env
 
 __all__ = [
-    "Actor", "Params", "Twins", "act", "constant_log_std", "spread", "squashed", "to_policy",
+    "Actor", "Params", "Twins", "act", "constant_log_std", "distribution", "squashed", "to_policy",
 ]  # fmt: skip
 
 LOG_STD_RANGE = (-10.0, 2.0)
@@ -89,7 +89,7 @@ def squashed(mean: Array, log_std: Array, noise: Array) -> tuple[Array, Array]:
     return jnp.tanh(v)[..., 0], log_prob[..., 0]
 
 
-def spread(actor: Actor, params: Params, obs: Array) -> tuple[Array, Array]:
+def distribution(actor: Actor, params: Params, obs: Array) -> tuple[Array, Array]:
     """Mean and log standard deviation (..., 1) of an ``Actor`` for observations (..., obs_size)."""
     return cast(tuple[Array, Array], actor.apply(params, obs))
 
@@ -99,7 +99,7 @@ def act(actor: Actor, params: Params, obs: Array, key: Array) -> tuple[Array, Ar
 
     ``key`` is consumed.
     """
-    mean, log_std = spread(actor, params, obs)
+    mean, log_std = distribution(actor, params, obs)
     return squashed(mean, log_std, jax.random.normal(key, mean.shape, mean.dtype))
 
 
