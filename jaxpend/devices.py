@@ -7,6 +7,7 @@ how many devices there are, up to rounding.
 
 import contextlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import jax
@@ -122,16 +123,17 @@ def everywhere(tree: Any) -> Any:
     return jax.tree.map(put, tree)
 
 
-def split(function: Callable[..., Any]) -> Callable[..., Any]:
+def split(function: Callable[..., Any], *same: Any) -> Callable[..., Any]:
     """A function of rows, of which each device computes its share where ``together`` is in force.
 
-    ``function`` takes pytrees of arrays (n, ...), gives pytrees of arrays (n, ...), and treats
-    every row alone, as one made by ``jax.vmap`` does. Where the devices do not divide n, the last
-    row is computed several times.
+    ``function`` takes ``same``, pytrees of arrays that all rows have in common, and then pytrees of
+    arrays (n, ...); it gives pytrees of arrays (n, ...), and treats every row alone, as one made by
+    ``jax.vmap`` does. It must not close over what is traced: jax refuses ``zeros_like`` and the
+    like of that. Where the devices do not divide n, the last row is computed several times.
     """
     size = _shares()
     if size == 1:
-        return function
+        return partial(function, *same)
 
     def shared(*rows: Any) -> Any:
         n = len(jax.tree.leaves(rows)[0])
@@ -140,8 +142,9 @@ def split(function: Callable[..., Any]) -> Callable[..., Any]:
         rows = jax.lax.with_sharding_constraint(rows, PartitionSpec())
         filled = jax.tree.map(lambda leaf: leaf[index], rows) if n % size else rows
         by_row = PartitionSpec(AXIS)
-        share = jax.shard_map(function, in_specs=by_row, out_specs=by_row, check_vma=False)
-        found = jax.tree.map(lambda leaf: leaf[:n], share(*filled))
+        specs = (PartitionSpec(),) * len(same) + (by_row,) * len(filled)
+        share = jax.shard_map(function, in_specs=specs, out_specs=by_row, check_vma=False)
+        found = jax.tree.map(lambda leaf: leaf[:n], share(*same, *filled))
         return jax.lax.with_sharding_constraint(found, PartitionSpec())
 
     return shared

@@ -1,6 +1,7 @@
 """Writing files so that no reader, and no crash, ever sees half of one; strict JSON for them."""
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -35,13 +36,15 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
 
     A reader, or a crash, sees the old content or the new, whole. What a killed process leaves
     has a name that ``TEMPORARY`` matches and nothing else has. A device or a pipe is written to,
-    not replaced.
+    not replaced, and of a symbolic link what it points to is.
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file() and not path.is_dir():
         with path.open("wb") as file:
             yield file
         return
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.jaxpend-tmp-{os.getpid()}")
     try:
@@ -55,7 +58,9 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
 def write_atomically(path: str | Path, content: bytes | str) -> None:
     """Replace a file as ``replacing`` does."""
     with replacing(path) as file:
-        file.write(content.encode() if isinstance(content, str) else content)
+        if isinstance(content, str):  # a name of a file that is not UTF-8 has surrogates
+            content = content.encode(errors="backslashreplace")
+        file.write(content)
 
 
 def remove_temporary(folder: Path) -> None:

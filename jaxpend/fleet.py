@@ -104,7 +104,7 @@ def off(scenario: Scenario, nominal: Plant) -> dict[str, jax.Array]:
     assert scenario.delay_jitter is not None
     found |= {"delay": DT * scenario.delay[0], "jitter": DT * scenario.delay_jitter}
     found["responsiveness"] = scenario.responsiveness
-    return found | {"push": jnp.abs(scenario.pulses.amplitude).max()}
+    return found | {"push": jnp.abs(scenario.pulses.amplitude).max(initial=0.0)}
 
 
 @partial(jax.jit, static_argnames="task")
@@ -113,7 +113,7 @@ def _tried(controller: Controller, keys: jax.Array, task: Task) -> tuple[Any, ..
     spread, line = task.spread, task.height
     assert spread is not None
 
-    def one(key: jax.Array, pushed: jax.Array) -> tuple[Any, ...]:
+    def one(controller: Controller, key: jax.Array, pushed: jax.Array) -> tuple[Any, ...]:
         key_robot, key_run = jax.random.split(key)
         scenario = draw(spread, task.plant, key_robot, pushed=pushed, duration=task.duration)
         run = rollout(scenario, controller, key_run, dt=task.dt, duration=task.duration)
@@ -125,11 +125,11 @@ def _tried(controller: Controller, keys: jax.Array, task: Task) -> tuple[Any, ..
         good = task.stands(run.x, length) & ~c.diverged
         return (good, task.score(c), down, c.diverged), off(scenario, task.plant)
 
-    def both(key: jax.Array) -> tuple[Any, ...]:
-        found, quantities = jax.vmap(partial(one, key))(jnp.array([False, True]))
+    def both(controller: Controller, key: jax.Array) -> tuple[Any, ...]:
+        found, quantities = jax.vmap(partial(one, controller, key))(jnp.array([False, True]))
         return found, {name: pair[1] for name, pair in quantities.items()}
 
-    return devices.split(jax.vmap(both))(keys)
+    return devices.split(jax.vmap(both, in_axes=(None, 0)), controller)(keys)
 
 
 def judge_fleet(

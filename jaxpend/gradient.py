@@ -130,8 +130,13 @@ def slope(config: GradientConfig, start: Controller, task: Task, z: jax.Array, k
         return ascent, lost, metrics
     keys = jax.random.split(key, 2 * config.scenarios)
     scenarios = jax.vmap(task.sample)(keys[: config.scenarios])
-    each = jax.value_and_grad(lambda z, s, k: robustness(config, rebuild(z), s, k, task))
-    found = devices.split(jax.vmap(partial(each, z)))(scenarios, keys[config.scenarios :])
+
+    def each(z: jax.Array, start: Controller, scenario: Scenario, key: jax.Array) -> jax.Array:
+        rebuild = coordinates(start, config.searched)[-1]
+        return robustness(config, rebuild(z), scenario, key, task)
+
+    every = jax.vmap(jax.value_and_grad(each), in_axes=(None, None, 0, 0))
+    found = devices.split(every, z, start)(scenarios, keys[config.scenarios :])
     values, ascents, finite = jax.vmap(partial(_usable, config))(*found)
     weight, kept = config.objective.weight, jnp.maximum(finite.sum(), 1)
     ascent = (1 - weight) * ascent + weight * ascents.sum(axis=0) / kept

@@ -225,6 +225,10 @@ def identify(
     plain = from_dict(nominal)  # refuses what no plant has
     base = dict.fromkeys(SCALES, 0.0) | {"g": float(plain.gravity), "gr": float(plain.gear_ratio)}
     base |= {name: float(v) for name, v in nominal.items() if name not in ("tl1", "tl2")}
+    for name in names:
+        if name not in SCALES and not base[name] > 0:
+            text = f"{name} is {base[name]:g} where the search starts; to be fitted it must be"
+            raise JaxpendError(f"{text} positive")
     scales = np.array([SCALES.get(name, abs(base[name])) for name in names])
     windows = _cut(recordings, window)
     with jax.enable_x64(True):

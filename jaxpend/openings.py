@@ -94,11 +94,12 @@ def explore(config: OpeningsConfig, policy: Policy, task: Task) -> tuple[Criteri
     """
     key = jax.random.key(0)
 
-    def run(share, until):
+    def run(policy, share, until):
         return performance(Opened(policy, share, until), task.plant, key, task)
 
     own = performance(policy, task.plant, key, task).tau_smoothness
-    c = devices.split(jax.vmap(run))(*map(jnp.asarray, grid(config)))
+    every = jax.vmap(run, in_axes=(None, 0, 0))
+    c = devices.split(every, policy)(*map(jnp.asarray, grid(config)))
     return c, task.score(c.replace(tau_smoothness=jnp.broadcast_to(own, c.energy.shape)))
 
 

@@ -3,7 +3,7 @@
 from importlib import resources
 from pathlib import Path
 
-from .errors import choose
+from .errors import JaxpendError, choose
 
 __all__ = ["ROBOTS", "SHIPPED", "active_joint", "shipped"]
 
@@ -24,6 +24,8 @@ def active_joint(robot: str) -> int:
 
 def shipped(robot_or_path: str | Path, folder: str) -> Path:
     """The file in ``folder`` that ships, by its name in ``SHIPPED``; else the path itself."""
+    if not isinstance(robot_or_path, str | Path):
+        raise JaxpendError(f"{robot_or_path!r:.40} is no path, and no name of what ships")
     if str(robot_or_path) not in SHIPPED:
         return Path(robot_or_path)
     return Path(str(resources.files(__package__).joinpath(f"{folder}/{robot_or_path}.npz")))

@@ -14,7 +14,8 @@ from .errors import JaxpendError
 from .plant import Plant, rk4_step
 from .pytree import Pytree, pytree
 from .resets import begun, push
-from .scenario import DT, DURATION, Scenario
+from .scenario import DT, DURATION, Scenario, check_values
+from .stepping import called_every
 
 __all__ = [
     "SLOTS", "Sensors", "Trajectory", "actuate", "draws", "final_state", "measure", "rollout",
@@ -61,6 +62,8 @@ def draws(scenario: Scenario, key, normals, steps: int, dtype) -> dict[str, jax.
     if scenario.delay_jitter is not None:
         found["delay_jitter"] = jax.random.uniform(jitter_key, (steps,), dtype)
     if normals is not None:
+        if (shape := jnp.shape(normals)) != (steps, 10):
+            raise JaxpendError(f"normals have shape {shape}; they must be ({steps}, 10)")
         return found | {n: jnp.asarray(normals, dtype)[:, slice(*NOISE[n])] for n in noisy}
     keys = dict(zip(NOISE, noise_keys, strict=True))
     columns = {name: NOISE[name][1] - NOISE[name][0] for name in noisy}
@@ -191,9 +194,14 @@ def _closed_loop(
     return Trajectory(jnp.asarray(stamps.astype(dtype)), x, u, measured, command)
 
 
-def _check(scenario: Scenario | Plant, controller: Controller, delay_slots: int) -> Scenario:
+def _check(
+    scenario: Scenario | Plant, controller: Controller, dt: float, delay_slots: int
+) -> tuple[Scenario, Controller]:
     check_form(controller)
     scenario = Scenario(scenario) if isinstance(scenario, Plant) else scenario
+    if not isinstance(scenario, Scenario):
+        raise JaxpendError(f"{scenario!r:.40} is no scenario; give a Scenario or a Plant")
+    check_values(scenario)
     if scenario.x0 is not None and (shape := jnp.shape(scenario.x0)) != (4,):
         text = f"x0 has shape {shape}; one rollout starts from (4,): vmap over batches of scenarios"
         raise JaxpendError(text)
@@ -202,7 +210,7 @@ def _check(scenario: Scenario | Plant, controller: Controller, delay_slots: int)
             f"a delay of {longest} steps does not fit in a buffer of {delay_slots} states; "
             f"pass delay_slots={longest + 1} or more"
         )
-    return scenario
+    return scenario, called_every(controller, dt)
 
 
 def rollout(
@@ -233,10 +241,11 @@ def rollout(
             2 torque, 4 process.
 
     Raises:
-        JaxpendError: dt or duration not positive, a delay longer than the buffer, what is no
+        JaxpendError: dt or duration not positive, values that mean nothing (see
+            ``check_values``), a delay longer than the buffer, what is no scenario or no
             controller, or a torque of another shape.
     """
-    scenario = _check(scenario, controller, delay_slots)
+    scenario, controller = _check(scenario, controller, dt, delay_slots)
     options = (dt, duration, integrator, delay_slots)
     return _closed_loop(scenario, controller, key, *options, normals, record=True)
 
@@ -257,7 +266,7 @@ def final_state(
     delay_slots: int = SLOTS,
 ) -> jax.Array:
     """Only the last true state of ``rollout``, shape (4,): no trajectory is kept in memory."""
-    scenario = _check(scenario, controller, delay_slots)
+    scenario, controller = _check(scenario, controller, dt, delay_slots)
     return _final_state(scenario, controller, key, dt, duration, integrator, delay_slots)
 
 

@@ -67,12 +67,15 @@ def imperfect(
     key_scenarios, key_runs = jax.random.split(key)
     scenarios = jax.vmap(task.sample)(jax.random.split(key_scenarios, count))
 
-    def one(scenario: Scenario, key: jax.Array) -> tuple[Criteria, jax.Array]:
+    def one(
+        controller: Controller, scenario: Scenario, key: jax.Array
+    ) -> tuple[Criteria, jax.Array]:
         options: dict[str, Any] = {"dt": task.dt, "duration": task.duration}
         run = rollout(scenario, controller, key, **options)
         return task.criteria(run, scenario.plant), task.stands(run.x, scenario.plant.length)
 
-    return devices.split(jax.vmap(one))(scenarios, jax.random.split(key_runs, count))
+    every = jax.vmap(one, in_axes=(None, 0, 0))
+    return devices.split(every, controller)(scenarios, jax.random.split(key_runs, count))
 
 
 def combined(
@@ -125,8 +128,8 @@ def trial_run(
 def _trials(
     controller: Controller, scenarios: Scenario, seeds: jax.Array, task: Task
 ) -> tuple[Criteria, jax.Array]:
-    every = jax.vmap(lambda scenario, seed: trial_run(controller, scenario, task, seed)[1:])
-    return devices.split(every)(scenarios, seeds)
+    every = jax.vmap(lambda c, scenario, seed: trial_run(c, scenario, task, seed)[1:], (None, 0, 0))
+    return devices.split(every, controller)(scenarios, seeds)
 
 
 @partial(jax.jit, static_argnames="task")
@@ -235,7 +238,8 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
 
     Raises:
         JaxpendError: it is none of this board's runs: longer, or of another robot, or, where it
-            must be regular, on another time grid.
+            must be regular, on another time grid or with torques beyond the limit; or it holds
+            numbers that are not finite, or time stamps that do not rise.
     """
     task = board(judged_on).task
     t, x, u = (np.asarray(values, float) for values in (run.t, run.x, run.u))
@@ -243,6 +247,10 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
     if count < 3 or u.shape not in ((count, 2), (count - 1, 2)) or x.shape != (count, 4):
         shapes = f"t {t.shape}, x {x.shape}, u {u.shape}"
         raise JaxpendError(f"the run has {shapes}; it must have three or more (N,), (N, 4), (N, 2)")
+    if not all(np.isfinite(values).all() for values in (t, x, u)):
+        raise JaxpendError("the run holds numbers that are not finite")
+    if not (np.diff(t) > 0).all():
+        raise JaxpendError("the time stamps of the run do not rise")
     if (last := float(t[-1])) > 1.01 * task.duration:
         raise JaxpendError(
             f"the run lasts {last:.7g} s; a run of this board lasts {task.duration:g}"
@@ -255,6 +263,11 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
             f"of this board starts at 0 and has steps of {task.dt:g} s (a robot's: --hardware)"
         )
     driven, passive = (float(abs(u[:, joint]).max()) for joint in (task.joint, 1 - task.joint))
+    if regular and task.spread is None and driven > 1.01 * task.torque_limit:
+        text = f"torques of up to {driven:.3g} N m; the motor of this board gives"
+        raise JaxpendError(
+            f"joint {task.joint + 1} has {text} {task.torque_limit:g} (a robot's: --hardware)"
+        )
     if passive > (1e-6 if regular else max(driven, PASSIVE)) and not task.resets:
         raise JaxpendError(
             f"joint {2 - task.joint} has torques of up to {passive:.3g} N m, but the {task.robot} "

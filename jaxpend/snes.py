@@ -163,14 +163,15 @@ def evolve(
         key, key_ask, key_noise, key_tell = jax.random.split(state.key, 4)
         population, inner = strategy.ask(key_ask, state.strategy, params)
 
-        def judged(individuals):
+        def judged(start, unit, key, individuals):
+            rebuild = coordinates(start, config.searched)[-1]
             return jax.lax.map(
-                lambda p: fitness(config, search.rebuild(p), key_noise, task),
+                lambda p: fitness(config, rebuild(unit * p), key, task),
                 individuals,
                 batch_size=_group(*individuals.shape),
             )
 
-        scores, diverged = devices.split(judged)(population)
+        scores, diverged = devices.split(judged, start, search.unit, key_noise)(population)
         if config.strategy == "lm_ma_es":  # evosax weighs what it remembers by place, not by rank
             order = jnp.argsort(-scores)
             population, scores = population[order], scores[order]

@@ -4,6 +4,7 @@ A step is compiled once for each kind of controller and precision. The precision
 when the controller is started, whatever the type of the numbers that come in.
 """
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -16,7 +17,24 @@ from .fields import Positive, Seed, checked
 from .pytree import Pytree
 from .scenario import DT
 
-__all__ = ["Startable", "Stepper"]
+__all__ = ["Startable", "Stepper", "called_every"]
+
+
+def called_every(controller: Any, dt: float) -> Any:
+    """A controller, or a part of one, whose observers count on being called every ``dt`` s.
+
+    Of the parts that are dataclasses those are changed that say ``COUNTS_CALLS``.
+    """
+    if not dataclasses.is_dataclass(controller) or isinstance(controller, type):
+        return controller
+    parts = {f.name: getattr(controller, f.name) for f in dataclasses.fields(controller)}
+    changed = {name: called_every(part, dt) for name, part in parts.items()}
+    if getattr(controller, "COUNTS_CALLS", False):
+        changed["dt"] = dt
+    changed = {name: part for name, part in changed.items() if part is not parts[name]}
+    if not changed or changed == {"dt": parts.get("dt")}:
+        return controller
+    return dataclasses.replace(controller, **changed)
 
 
 def _strong(tree: Any) -> Any:
@@ -96,7 +114,7 @@ class Stepper:
         self.dt, self.seed = checked(Positive, dt, "dt"), checked(Seed, seed, "seed")
         self._dtype = jnp.result_type(float)
         self._x64 = bool(self._dtype == jnp.float64)
-        self._controller = _of_type(controller, self._dtype)
+        self._controller = _of_type(called_every(controller, self.dt), self._dtype)
         self.reset()
 
     def reset(self) -> None:

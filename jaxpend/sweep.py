@@ -17,6 +17,7 @@ from . import devices
 from .controller import Controller, check_controller
 from .criteria import EPSILON, HEIGHT, Criteria, criteria, score_v2, upright
 from .errors import JaxpendError
+from .fields import checked
 from .plant import Plant
 from .pytree import Pytree, pytree
 from .rollout import final_state, rollout
@@ -27,6 +28,8 @@ __all__ = [
     "EPSILON", "Outcome", "Survey", "at_least_one", "compile_sweep", "mildest_failure", "survey",
     "sweep", "upright",
 ]  # fmt: skip
+
+Ends = tuple[float, float]  # harmless, bad
 
 
 @pytree
@@ -43,14 +46,15 @@ class Outcome(Pytree):
 def _run(scenarios, controller, keys, *, scoring, height, duration, **options):
     """One chunk."""
 
-    def one(scenario, key):
+    def one(controller, scenario, key):
         if scoring is None:
             return final_state(scenario, controller, key, duration=duration, **options), None
         run = rollout(scenario, controller, key, duration=duration, **options)
         c = criteria(run.t, run.x, run.u, scenario.plant, height=height, t_final=duration)
         return run.x[-1], scoring(c)
 
-    x, score = devices.split(jax.vmap(one))(scenarios, keys)
+    every = jax.vmap(one, in_axes=(None, 0, 0))
+    x, score = devices.split(every, controller)(scenarios, keys)
     return Outcome(x, upright(x), ~jnp.all(jnp.isfinite(x), axis=-1), score)
 
 
@@ -71,9 +75,24 @@ def _chunks(scenarios: Scenario, keys: jax.Array, size: int) -> Iterator[tuple]:
         yield jax.tree.map(lambda leaf, at=index: leaf[at], (scenarios, keys))
 
 
+def _rows(scenarios: Scenario) -> int:
+    """How many scenarios a batch holds. Raises ``JaxpendError`` for what is no batch."""
+    if not isinstance(scenarios, Scenario) or np.ndim(scenarios.plant.mass) != 2:
+        what = type(scenarios).__name__
+        text = f"{what} is no batch of scenarios; vary(Scenario(plant), ...) makes one"
+        raise JaxpendError(text)
+    sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(scenarios)}
+    if len(sizes) > 1:
+        text = f"the parts of the batch have leading axes {sorted(sizes)}; they must be the same"
+        raise JaxpendError(text)
+    return len(scenarios.plant.mass)
+
+
 def at_least_one(**counts: int) -> None:
     """Raise ``JaxpendError`` for a count below 1; it is known by its name."""
     for name, count in counts.items():
+        if count != int(count):
+            raise JaxpendError(f"{name} is {count}; it must be a whole number")
         if count < 1:
             raise JaxpendError(f"{name} is {count}; it must be at least 1")
 
@@ -89,7 +108,7 @@ def _plan(
     slots = scenarios.longest_delay + 1
     static = {"dt": dt, "duration": duration, "delay_slots": slots}
     static |= {"scoring": scoring, "height": height} if scored else {"scoring": None, "height": 0}
-    keys = jax.random.split(key, len(scenarios.plant.mass))
+    keys = jax.random.split(key, _rows(scenarios))
     return _chunks(_lean(scenarios), keys, size), static
 
 
@@ -122,9 +141,10 @@ def sweep(
         The outcome with numpy arrays, n long.
 
     Raises:
-        JaxpendError: values that mean nothing (see ``check_values``), what is no controller, or
-            a chunk below 1.
+        JaxpendError: what is no batch, values that mean nothing (see ``check_values``), what is
+            no controller, or a chunk below 1.
     """
+    _rows(scenarios)
     check_values(scenarios)
     check_controller(controller)
     pieces, static = _plan(
@@ -132,7 +152,7 @@ def sweep(
         chunk=chunk,
     )  # fmt: skip
     outcomes = [devices.compute(_run, piece, controller, keys, **static) for piece, keys in pieces]
-    n = len(scenarios.plant.mass)
+    n = _rows(scenarios)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:n], *outcomes)
 
 
@@ -230,7 +250,7 @@ def mildest_failure(
         ``values``, else None in their place.
 
     Raises:
-        JaxpendError: as ``survey``, or fewer than one sample.
+        JaxpendError: as ``survey``, fewer than one sample, or a range that is not two numbers.
     """
     at_least_one(samples=samples)
     if not ranges:
@@ -239,7 +259,7 @@ def mildest_failure(
     fraction = np.asarray(jax.random.uniform(place_key, (samples, len(ranges))), float)
     # Uniform in severity: else almost all samples of many imperfections would be bad in one.
     fraction *= np.linspace(0, 1, samples)[:, None] / fraction.max(axis=1, keepdims=True)
-    ends = np.array(list(ranges.values()), float)
+    ends = np.array([checked(Ends, pair, f"the range of {n}") for n, pair in ranges.items()])
     values = ends[:, 0] + fraction * (ends[:, 1] - ends[:, 0])
     changes = dict(zip(ranges, values.T, strict=True))
     outcome = _varied(scenario, controller, changes, draw_key, run_key, options)

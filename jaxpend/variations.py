@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .errors import JaxpendError, choose
+from .fields import Positive, checked
 from .plant import Plant
 from .scenario import DT, Scenario, delay_steps, random_pulses
 
@@ -176,8 +177,10 @@ def vary(
         dt: s, for delays, which are cut off to whole steps of it.
 
     Raises:
-        JaxpendError: an unknown name, values of different number, out of range or not finite.
+        JaxpendError: an unknown name, values of different number, out of range or not finite, or
+            a dt that is not positive.
     """
+    dt = checked(Positive, dt, "dt")
     values = {name: numbers(name, given) for name, given in changes.items()}
     sizes = {len(v) for v in values.values()}
     if not sizes:

@@ -1,21 +1,30 @@
 """What 1, 3 and 8 devices compute of the same rows: JSON. ``test_devices`` runs it in a process."""
 
+import dataclasses
 import json
 import sys
+from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from conftest import shipped_network, task_of
 
-from jaxpend import devices
-from jaxpend.config import SACConfig
+from jaxpend import devices, gradient, snes
+from jaxpend.boards import BOARDS
+from jaxpend.config import GradientConfig, Objective, SACConfig, SNESConfig
+from jaxpend.controller import Memoryless
 from jaxpend.controllers.callback import realaigym
+from jaxpend.controllers.search_space import FACTOR
+from jaxpend.fleet import judge_fleet
+from jaxpend.pytree import pytree
 from jaxpend.runs.checkpoints import Checkpoints
 from jaxpend.sac import algorithm
 from jaxpend.sac.stage import SAC
 from jaxpend.scenario import Scenario
+from jaxpend.score import official
 from jaxpend.sweep import compile_sweep, sweep
 from jaxpend.variations import vary
 
@@ -47,16 +56,56 @@ def swept(controller):
     return sweep(scenarios, controller, KEY, duration=1.0).x
 
 
+@pytree
+class Copying(Memoryless):
+    """A controller that makes arrays like its own, and looks into them, as jax does."""
+
+    SEARCHED: ClassVar = {"gain": FACTOR}
+    gain: jax.Array  # (4,)
+
+    def reset(self, key):
+        return jnp.zeros_like(self.gain)
+
+    def __call__(self, carry, t, x):
+        error = jnp.full_like(self.gain, jnp.pi).at[1:].set(0.0) - x
+        row = jnp.eye(2)[jnp.argmin(self.gain) // 4]
+        return carry, (self.gain[jnp.argsort(self.gain)] @ error + carry.sum()) * row
+
+
+def doors():
+    """What a controller that copies its arrays is worth, wherever rows are split."""
+    controller = Copying(jnp.array([3.0, 4.0, 5.0, 6.0]))
+    board = BOARDS["hardware"]["pendubot"]
+    still = dataclasses.replace(board.task.spread, pushes=0)
+    board = dataclasses.replace(
+        board, draws=3, task=dataclasses.replace(board.task, duration=3.0, spread=still)
+    )
+    random = {"scenarios": 3, "objective": Objective(weight=0.5)}
+    search = SNESConfig(population=3, **random)
+    state = snes.init(search, controller, KEY)
+    evolve = partial(snes.evolve, search, generations=1, task=TASK)
+    evolved, _ = devices.compute(evolve, controller, state)
+    ascent = GradientConfig(duration=0.2, scenario_duration=0.2, **random)
+    state = gradient.init(ascent, controller, KEY)
+    climb = partial(gradient.improve, ascent, steps=2, task=TASK)
+    climbed, _ = devices.compute(climb, controller, state)
+    return [
+        *swept(controller).ravel().tolist(), official(controller, board)["criteria"]["energy"],
+        *judge_fleet(controller, board.task, KEY, robots=3).down.ravel().tolist(),
+        *evolved.strategy.mean.tolist(), *climbed.parameters.tolist(),
+    ]  # fmt: skip
+
+
 def split():
     """Sums over rows of a function that is split, within a vmap, a gradient and another split."""
     rows, weights = jnp.arange(11.0).reshape(11, 1), jnp.array([1.0, 2.0])
 
     def of_rows(weight, rows):
-        def row(x):
+        def row(weight, x):
             inner = devices.split(jax.vmap(lambda y: jnp.sin(weight * y)))
             return {"sine": inner(x + jnp.arange(3.0)), "row": x[0]}
 
-        return devices.split(jax.vmap(row))(rows)
+        return devices.split(jax.vmap(row, in_axes=(None, 0)), weight)(rows)
 
     def total(weight):
         return of_rows(weight, rows)["sine"].sum()
@@ -98,6 +147,7 @@ def main(folder: Path) -> None:
             continue
         found[count] |= {
             "python": swept(realaigym(Counting())).tolist(),
+            "doors": doors(),
             "exchanged": exchanged(),
             "sac": learned(folder / str(count)),
         }

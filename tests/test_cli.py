@@ -425,11 +425,19 @@ def test_a_terminal_with_no_room_is_written_beyond(runs, columns):
 
 
 def test_a_platform_that_is_not_there_is_said():
-    for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
-        done = command("jaxpend score", **{name: "nonsense"})
+    said = {
+        ("JAX_PLATFORMS", "nonsense"): "JAX_PLATFORMS is 'nonsense', which jax cannot use here: ",
+        ("JAX_PLATFORMS", "cuda"): "JAX_PLATFORMS is 'cuda', which jax cannot use here: ",
+        ("JAX_PLATFORM_NAME", "nonsense"): "JAX_PLATFORM_NAME is 'nonsense', which jax cannot use",
+        ("JAX_NUM_CPU_DEVICES", "0"): "JAX_NUM_CPU_DEVICES is '0', which jax cannot use here: ",
+        ("JAX_NUM_CPU_DEVICES", "x"): "jax does not take a variable of the environment: ",
+        ("JAX_ENABLE_X64", "maybe"): "jax does not take a variable of the environment: ",
+        ("MPLBACKEND", "nonsense"): "MPLBACKEND is 'nonsense', which matplotlib does not take: ",
+    }
+    for (name, value), words in said.items():
+        done = command("jaxpend score", **{name: value})
         assert done.returncode == 2
-        start = f"jaxpend score: {name} is 'nonsense', which jax cannot use here: "
-        assert done.stderr.startswith(start)
+        assert done.stderr.startswith(f"jaxpend score: {words}")
         assert done.stderr.count("\n") == 1
 
 

@@ -200,3 +200,26 @@ def test_files_of_earlier_versions_still_load(tmp_path):
 
     rewrite(path, former)
     same(load_controller(path, robot="pendubot"), made)
+
+
+def test_numbers_of_numpy_in_a_static_field_are_numbers(tmp_path):
+    policy = load_policy("demonstrated_pendubot")
+    odd = network_in(policy).replace(control_dt=np.float64(0.01))
+    save_controller(tmp_path / "odd.npz", odd, "pendubot")
+    assert load_policy(tmp_path / "odd.npz").control_dt == 0.01
+
+
+def test_what_is_no_path_is_one_sentence(tmp_path):
+    for value in (None, 5):
+        with refused(f"{value} is no path, and no name of what ships"):
+            load_policy(value)
+    with pytest.raises(IsADirectoryError) as error:
+        save_policy(tmp_path, load_policy("pendubot"))
+    assert error.value.filename == str(tmp_path)
+
+
+def test_a_link_stays_one_and_its_file_is_written(tmp_path):
+    (tmp_path / "link.npz").symlink_to("real.npz")
+    save_policy(tmp_path / "link.npz", load_policy("pendubot"))
+    assert (tmp_path / "link.npz").is_symlink()
+    assert (tmp_path / "real.npz").is_file()

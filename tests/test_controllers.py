@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import refused
 from scipy.linalg import schur
 
 from jaxpend import JaxpendError, Scenario, designs, rollout
@@ -15,6 +16,7 @@ from jaxpend.controllers import (
     Hybrid,
     OpenLoop,
     Tolerances,
+    Zero,
     delay_tolerant,
     ellipsoid_of_torque,
     energy_shaping,
@@ -29,6 +31,7 @@ from jaxpend.controllers import (
 )
 from jaxpend.controllers.catalogue import CATALOGUE, build
 from jaxpend.controllers.energy import PERIOD
+from jaxpend.controllers.hybrid import with_lqr
 from jaxpend.plant import dynamics, rk4_step, total_energy
 from jaxpend.score import official
 
@@ -134,7 +137,13 @@ def test_tvlqr_that_tolerates_delay_is_soft_once_it_has_arrived():
     assert torque != stiffer
 
 
-@pytest.mark.parametrize("bad", [{"q": (1, 1, 1)}, {"q": (-1, 1, 1, 1)}, {"r": 0}, {"dt": 0}])
+BAD_LQR = [
+    {"q": (1, 1, 1)}, {"q": (-1, 1, 1, 1)}, {"q": (np.inf, 1, 1, 1)}, {"r": 0}, {"r": np.inf},
+    {"dt": 0}, {"dt": np.inf},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("bad", BAD_LQR)
 def test_bad_weights_of_lqr_are_one_sentence(bad):
     with pytest.raises(JaxpendError, match="LQR needs q of 4 values >= 0, r > 0"):
         lqr(designs.competition("acrobot"), "acrobot", **bad)
@@ -311,6 +320,29 @@ def test_mpc_that_is_lost_finds_its_turn_and_holds_the_top():
 def test_mpc_rejects_horizons_that_do_not_fit():
     with pytest.raises(JaxpendError, match="1 <= every < horizon"):
         tracking_mpc(designs.competition("acrobot"), reference("acrobot"), horizon=5, every=5)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda p: free_mpc(p, "pendubot", r=-1.0), "r is -1.0; it must be positive"),
+        (lambda p: free_mpc(p, "pendubot", q=(1, 1)), "q is (1, 1); it must be 4 values"),
+        (lambda p: free_mpc(p, "pendubot", q=(-1, 1, 1, 1)), "q is (-1, 1, 1, 1); it must be 4"),
+        (lambda p: free_mpc(p, "pendubot", smoothness=-1.0), "smoothness is -1.0; it must not be"),
+        (lambda p: free_mpc(p, "pendubot", starts=0), "starts is 0; it must be positive"),
+        (lambda p: free_mpc(p, "pendubot", horizon=9.5), "horizon is 9.5; it must be an integer"),
+        (lambda p: free_mpc(p, "pendubot", dt=0.0), "dt is 0.0; it must be positive"),
+        (lambda p: tracking_mpc(p, reference("pendubot"), every=2.5), "every is 2.5; it must be"),
+        (lambda p: pd(p, "pendubot", kp=np.nan), "kp is nan; it must not be negative"),
+        (lambda p: with_lqr(Zero(), p, "pendubot", fraction=-1.0), "fraction is -1.0; it must be"),
+        (lambda p: with_lqr(Zero(), p, "pendubot", hysteresis=0.1), "hysteresis is 0.1; it must"),
+        (lambda p: energy_shaping(p, "pendubot", (1.0,) * 5), "gains is (1.0, 1.0, 1.0, 1.0, 1.0)"),
+        (lambda p: lqr(p.replace(mass=p.mass * np.nan), "pendubot"), "no LQR for this plant"),
+    ],
+)
+def test_constants_that_make_no_sense_are_one_sentence(make, words):
+    with refused(words):
+        make(designs.competition("pendubot"))
 
 
 # --- all of them -----------------------------------------------------------------------------

@@ -26,12 +26,13 @@ def found(tmp_path_factory):
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("what", ["split", "sweep", "sac"])
+@pytest.mark.parametrize("what", ["split", "sweep", "doors", "sac"])
 def test_any_number_of_devices_computes_the_same(found, what):
     for count in {"3", "8"} & {n for n, parts in found.items() if what in parts}:
         one, many = (np.hstack(found[n][what]) for n in ("1", count))
         assert len(np.unique(one)) > 1
-        np.testing.assert_allclose(many, one, rtol=2e-3, atol=2e-4)
+        # Times at which an arm that falls crosses the line are among what is behind the doors.
+        np.testing.assert_allclose(many, one, rtol=1e-2 if what == "doors" else 2e-3, atol=2e-4)
 
 
 def test_what_calls_python_has_one_state_at_a_time(found):

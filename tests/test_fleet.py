@@ -307,3 +307,9 @@ def test_tasks_and_sensors_that_make_no_sense_are_refused():
             check_values(robot.replace(**{field: getattr(robot, field).replace(**bad)}))
     free = robot.compensation.plant.replace(torque_limit=np.full(2, np.inf))
     check_values(robot.replace(compensation=robot.compensation.replace(plant=free)))
+
+
+def test_robots_that_nobody_pushes_can_be_drawn():
+    scenario = draw(Spread(pushes=0), TASK.plant, jax.random.key(0), pushed=True, duration=2.0)
+    assert scenario.pulses.amplitude.shape == (2, 0)
+    np.testing.assert_array_equal(scenario.pulses.torque(1.0), 0.0)

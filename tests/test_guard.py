@@ -273,3 +273,13 @@ def test_nonsense_is_refused_and_nothing_is_added_for_nothing():
             observer(plant, **options)
     with refused("robot"):
         guard(main, "cartpole")
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.005, 0.01])
+def test_the_observer_counts_on_the_period_at_which_it_is_called(dt):
+    policy, plant = load_policy("pendubot"), designs.competition("pendubot")
+    run = rollout(plant, policy, KEY, dt=dt, duration=5.0)
+    assert upright(run.x[-1])
+    stepper = policy.start(dt=dt)
+    torques = np.array([stepper.torque(x) for x in run.x_measured[:20]])
+    np.testing.assert_allclose(torques, run.u_command[:20], atol=1e-4)

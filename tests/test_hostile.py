@@ -77,6 +77,9 @@ def template(tmp_path_factory):
     np.savez(folder / "pickled.npz", header=np.array({"a": 1}, dtype=object))
     with np.load(shipped / "acrobot.npz") as file:
         arrays = dict(file)
+    for name in ("site/report.html", "results/pendubot.csv", "results/identified_pendubot.png"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("mine")
     header = json.loads(str(arrays["header"])) | {"provenance": [1]}
     np.savez(folder / "provenance.npz", **arrays | {"header": np.array(json.dumps(header))})
     old = '{"robot": "acrobot"}'
@@ -178,6 +181,16 @@ CASES = [
     ("score --plant deep.yaml", "deep.yaml is nested too deeply, or holds itself"),
     ("score --plant self.yaml", "self.yaml: plant parameters must be a mapping"),
     ("score --plant .", "cannot read .: Is a directory"),
+    # Files of others are not written over.
+    ("optimise --robot pendubot --out acrobot_file.npz",
+     "cannot write acrobot_file.npz: it is there and is no trajectory file"),
+    ("robustness --controller pd --out results",
+     "cannot write results/pendubot.csv: it is there and is something else"),
+    ("hardware --controller pd --out results",
+     "cannot write results/identified_pendubot.png: it is there and is something else"),
+    ("report acrobot_file.npz --out site",
+     "cannot write site/report.html: it is there and is something else"),
+    ("identify own.py --out new --json new", "--json and --out are both new; name two files"),
     # Configurations.
     ("sac --config .", "cannot read .: Is a directory"),
     ("sac --config bytes", "bytes is not valid YAML"),

@@ -409,3 +409,21 @@ def test_a_board_gives_its_time_grid_and_its_score():
     # 10 s would be enough to fall out of the time grid: the score is that of the board, too.
     with_v2 = benchmark(BALANCE, standing, KEY, **options)
     assert np.all(with_v2.performance["m2"] < 1.0)
+
+
+def test_a_sweep_is_of_one_whole_batch():
+    batch = vary(Scenario(PLANT), {"m2": [0.5, 0.6, 0.7]}, key=KEY)
+    for scenarios, words in (
+        (batch.replace(x0=jnp.zeros((2, 4))), "leading axes [(2,), (3,)]; they must be the same"),
+        (Scenario(PLANT), "Scenario is no batch of scenarios"),
+        (PLANT, "Plant is no batch of scenarios"),
+    ):
+        with refused(words):
+            sweep(scenarios, Zero(), KEY, duration=0.02)
+    with refused("repetitions is 1.5; it must be a whole number"):
+        survey(PLANT, Zero(), {"m2": [0.5]}, KEY, repetitions=1.5)
+    with refused("dt is 0.0; it must be positive"):
+        vary(Scenario(PLANT), {"delay": [0.01]}, key=KEY, dt=0.0)
+    for ends in ((0.5, 0.6, 0.7), 0.5, ("a", 1)):
+        with refused("the range of m2 is"):
+            mildest_failure(PLANT, Zero(), {"m2": ends}, KEY, samples=2)

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxpend import Pulses, Scenario, final_state, rollout
+from jaxpend.boards import v2
 from jaxpend.controller import Memoryless
 from jaxpend.controllers import Feedback, OpenLoop, Zero
 from jaxpend.designs import active_joint, competition
@@ -364,3 +365,19 @@ def test_open_loop_holds_each_torque_until_the_next_stamp():
 def test_bad_input_is_one_sentence(call, words):
     with refused(words):
         call(competition("acrobot"))
+
+
+@pytest.mark.parametrize(
+    ("scenario", "options", "words"),
+    [
+        (lambda s: s.replace(delay=np.full(4, -3)), {}, "delay is -3; it must not be negative"),
+        (lambda s: s.replace(torque_noise=np.full(2, np.nan)), {}, "torque_noise holds a value"),
+        (lambda s: v2("pendubot").task, {}, "is no scenario; give a Scenario or a Plant"),
+        (lambda s: None, {}, "None is no scenario"),
+        (lambda s: s, {"normals": np.zeros((10, 5))}, "normals have shape (10, 5); they must be"),
+    ],
+)
+def test_what_is_no_scenario_is_refused(scenario, options, words):
+    start = Scenario(competition("pendubot"))
+    with refused(words):
+        rollout(scenario(start), Zero(), jax.random.key(0), duration=0.02, **options)

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, both_robots, excerpt
+from conftest import assert_close, both_robots, excerpt, refused
 
 from jaxpend import JaxpendError, Pulses, Scenario
 from jaxpend.designs import competition
-from jaxpend.scenario import delay_steps
+from jaxpend.scenario import delay_steps, random_pulses
 
 
 @both_robots
@@ -58,3 +58,18 @@ def test_the_widest_type_decides_what_a_rollout_computes_in():
 def test_absent_imperfections_are_not_leaves():
     plant = competition("acrobot")
     assert len(jax.tree.leaves(Scenario(plant))) == len(jax.tree.leaves(plant))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"per_joint": -1}, "per_joint is -1; it must not be negative"),
+        ({"per_joint": 9}, "18 pulses 1.0 s apart do not fit into 10.0 s"),
+        ({"distance": -1.0}, "distance is -1.0; it must not be negative"),
+        ({"width": (-1.0, 0.0)}, "width is (-1.0, 0.0); it must be a range, above 0"),
+        ({"amplitude": (5.0, 0.5)}, "amplitude is (5.0, 0.5); it must be a range, from 0 on"),
+    ],
+)
+def test_pulses_that_make_no_sense_are_refused(options, words):
+    with refused(words):
+        random_pulses(jax.random.key(0), **options)

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, both_precisions, both_robots, excerpt, task_of
+from conftest import assert_close, both_precisions, both_robots, excerpt, refused, task_of
 
-from jaxpend import JaxpendError
+from jaxpend import JaxpendError, rollout
 from jaxpend.controllers import Feedback, Zero
 from jaxpend.designs import competition
 from jaxpend.score import (
@@ -18,6 +18,7 @@ from jaxpend.score import (
     criteria,
     imperfect,
     official,
+    recorded,
     score_v1,
     score_v2,
     score_v3,
@@ -179,3 +180,23 @@ def test_a_run_that_diverges_is_said_to():
     judged = official(spinning, "acrobot")
     assert (judged["diverged"], judged["success"], judged["score"]) == (True, False, 0.0)
     assert not official(Zero(), "acrobot")["diverged"]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda run: run.replace(x=run.x.at[3000, 0].set(jnp.nan)), "numbers that are not finite"),
+        (lambda run: run.replace(u=run.u.at[3000, 1].set(jnp.nan)), "numbers that are not finite"),
+        (lambda run: run.replace(t=run.t.at[3000].set(jnp.inf)), "numbers that are not finite"),
+        (lambda run: run.replace(t=run.t[::-1]), "the time stamps of the run do not rise"),
+        (
+            lambda run: run.replace(u=run.u.at[9, 0].set(2950.0)),
+            "joint 1 has torques of up to 2",
+        ),
+    ],
+)
+def test_a_recording_of_no_such_run_is_refused(change, words):
+    run = rollout(competition("pendubot"), Zero(), jax.random.key(0))
+    assert recorded(run, "pendubot")["score"] == 0.0
+    with refused(words):
+        recorded(change(run), "pendubot")

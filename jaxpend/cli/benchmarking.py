@@ -4,8 +4,9 @@ from pathlib import Path
 from typing import Literal
 
 from ..fields import Count, Natural, Positive, Robot, Seed
+from ..robots import ROBOTS
 from .judging import Subject
-from .output import JSON, check_file, check_folder, emit_json
+from .output import JSON, check_file, check_results, emit_json
 
 __all__ = ["robustness"]
 
@@ -51,7 +52,9 @@ def robustness(
         out: folder for picture, CSV and JSON, of both robots once they are there; or None.
         json: write the result as JSON to this file, or "-" for standard output.
     """
-    check_folder(out)
+    marked = {name: (f"{name}.json", b'"over_keys"') for name in ROBOTS}
+    check_results(out, [f"{robot}.json", f"{robot}.csv", f"{robot}_map.png"], marked[robot])
+    check_results(out, ["robustness.png"], *marked.values())
     check_file(json, JSON)
     subject = Subject(robot, policy, controller, plant, design, torque_limit)
     import jax

@@ -5,6 +5,7 @@ import os
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 from ..errors import JaxpendError
 from ..fields import OFF, ON
@@ -65,26 +66,41 @@ def share_processor() -> None:
     said = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if said or "JAX_NUM_CPU_DEVICES" in os.environ:
         return
-    import jax
-
+    jax = _jax()
     known = hasattr(os, "sched_getaffinity")  # not on macOS
     cores = len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
     with contextlib.suppress(RuntimeError):  # whoever called has computed already
         jax.config.update("jax_num_cpu_devices", min(cores, MOST))
 
 
+def _jax() -> Any:
+    """jax. Raises ``JaxpendError`` where it does not take what the environment says."""
+    try:
+        import jax
+    except ValueError as error:
+        said = str(error).splitlines()[0]
+        raise JaxpendError(f"jax does not take a variable of the environment: {said}") from None
+    return jax
+
+
 def check_platform() -> None:
-    """Raise ``JaxpendError`` for a platform in the environment that jax does not have here.
+    """Raise ``JaxpendError`` for devices, in the environment, that jax does not have here.
 
-    Unasked, jax would say so in the middle of whatever is the first to compute.
+    Unasked, jax would say so in the middle of whatever is the first to compute. So too for what
+    draws pictures.
     """
-    for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
+    jax = _jax()
+    for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME", "JAX_NUM_CPU_DEVICES"):
         if os.environ.get(name):
-            import jax
-
             try:
                 jax.devices()
-            except RuntimeError as error:
+            except (RuntimeError, AssertionError) as error:  # without a reason: nothing is there
                 said = (str(error).strip() or "no reason given").splitlines()[0]
                 text = f"{name} is {os.environ[name]!r}, which jax cannot use here: {said}"
                 raise JaxpendError(text) from None
+    if os.environ.get("MPLBACKEND"):
+        try:
+            import matplotlib  # noqa: F401
+        except ValueError as error:
+            text = f"MPLBACKEND is {os.environ['MPLBACKEND']!r}, which matplotlib does not take"
+            raise JaxpendError(f"{text}: {str(error).splitlines()[0]:.120}") from None

@@ -5,7 +5,6 @@ for results are checked before it computes.
 """
 
 import dataclasses
-import os
 import sys
 import time
 from pathlib import Path
@@ -19,7 +18,7 @@ from .fleets import hardware as hardware
 from .identifying import identify as identify
 from .importing import import_ as import_
 from .judging import Subject, board_of, of_draws
-from .output import ARRAYS, JSON, MARKDOWN, check_file, check_folder, emit, emit_json
+from .output import JSON, MARKDOWN, check_apart, check_file, check_results, emit, emit_json
 
 
 def train(config: TrainRun, command: str) -> None:
@@ -97,7 +96,7 @@ def report(
         robustness: run the robustness benchmark too, seconds for every seed.
     """
     folder = out or (run if run.is_dir() else Path("runs") / run.stem)
-    check_folder(folder)
+    check_results(folder, ["report.html", "report"], ("report.html", b"jaxpend</title>"))
     from ..runs.reader import find, remarks
     from ..terminal import console
 
@@ -148,7 +147,7 @@ def score(
     """
     check_file(json, JSON)
     check_file(save)
-    _apart(json=json, save=save)
+    check_apart(json=json, save=save)
     from .. import boards
     from .tables import score_table
 
@@ -183,14 +182,6 @@ def _check_draws(board, seed, draws, save, csv):
         raise JaxpendError(f"--seed names a draw, of which the {board.name} board has none")
     if save is not None and csv is None and seed is None and board.task.chance:
         raise JaxpendError("--save writes one run; name its draw, such as --seed 0")
-
-
-def _apart(**files):
-    """Refuse options that name one file for two things."""
-    first, second = files
-    one, other = (path and str(path) for path in files.values())
-    if one and other and one != "-" and os.path.realpath(one) == os.path.realpath(other):
-        raise JaxpendError(f"--{first} and --{second} are both {one}; name two files")
 
 
 def _scored(subject, board, seed, save):
@@ -265,7 +256,7 @@ def leaderboard(
     """
     check_file(json, JSON)
     check_file(out, MARKDOWN)
-    _apart(json=json, out=out)
+    check_apart(json=json, out=out)
     from .. import leaderboard as boards
     from ..devices import use
     from ..terminal import console
@@ -301,15 +292,17 @@ def optimise(
         json: report of all optima to write; "-" for standard output.
         search: how widely to look.
     """
-    check_file(out, ARRAYS)
+    check_file(out)
     check_file(json, JSON)
-    _apart(json=json, out=out)
+    check_apart(json=json, out=out)
     import jax
 
     from ..boards import v2
-    from ..trajopt.reference import save_reference
+    from ..trajopt.reference import check_target, save_reference
     from ..trajopt.search import find
 
+    if out is not None:
+        check_target(out)
     start = time.perf_counter()
 
     def say(line: str) -> None:

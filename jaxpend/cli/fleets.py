@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ..fields import Count, Natural, Preset, Robot, Seed
 from .judging import Subject
-from .output import JSON, check_file, check_folder, emit_json
+from .output import JSON, check_file, check_results, emit_json
 
 __all__ = ["hardware"]
 
@@ -39,7 +39,8 @@ def hardware(
         out: folder for the picture and the JSON; or None.
         json: write the result as JSON to this file, or "-" for standard output.
     """
-    check_folder(out)
+    name = f"{preset}_{robot}"
+    check_results(out, [f"{name}.json", f"{name}.png"], (f"{name}.json", b'"by"'))
     check_file(json, JSON)
     subject = Subject(robot, policy, controller, plant, design, on="hardware")
     import jax

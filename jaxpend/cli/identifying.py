@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ..errors import JaxpendError
 from ..fields import Positive
-from .output import JSON, check_file, emit_json
+from .output import JSON, check_apart, check_file, emit_json
 
 __all__ = ["identify"]
 
@@ -40,6 +40,7 @@ def identify(
         raise JaxpendError("--plant and --design are both given; the search starts from one")
     check_file(out, (BEGINS,))
     check_file(json, JSON)
+    check_apart(json=json, out=out)
     from .. import designs
     from ..files import write_atomically
     from ..identification import FITTED
@@ -54,7 +55,7 @@ def identify(
         found = fit(runs, nominal, parameters or FITTED, window=window)
     if json != "-":
         identified_table(found, nominal)
-    names = shlex.join(map(str, recordings))
+    names = shlex.join(repr(str(path))[1:-1] for path in recordings)  # on one line
     lines = [f"{BEGINS.decode()}{names}", f"# delay of measurements: {found.delay:.5g} s"]
     for name, value in found.parameters.items():
         known = found.deviations.get(name)

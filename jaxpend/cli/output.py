@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,12 @@ from ..errors import JaxpendError
 from ..files import to_json, write_atomically
 
 __all__ = [
-    "ARRAYS", "JSON", "MARKDOWN", "check_file", "check_folder", "drop_unwritable", "emit",
-    "emit_json",
+    "JSON", "MARKDOWN", "check_apart", "check_file", "check_folder", "check_results",
+    "drop_unwritable", "emit", "emit_json",
 ]  # fmt: skip
 
 # How files begin that commands write, of all that is written with one purpose.
-JSON, MARKDOWN, ARRAYS = (b"{", b"["), (b"| controller ",), (b"PK",)
+JSON, MARKDOWN = (b"{", b"["), (b"| controller ",)
 
 
 def emit(text: str, target: str | Path | None) -> None:
@@ -65,6 +66,32 @@ def check_folder(path: str | Path | None) -> None:
         raise JaxpendError(f"cannot write into {path}: {there} is not a folder")
     if not os.access(there, os.W_OK | os.X_OK):
         raise JaxpendError(f"cannot write into {path}: {there} is not writable")
+
+
+def check_results(folder: Path | None, names: Iterable[str], *marked: tuple[str, bytes]) -> None:
+    """``check_folder``, and refuse files in it that are not of this program; None: no folder.
+
+    Files of those names are of this program where one of the ``marked``, names and what such a
+    file holds, is there too.
+    """
+    check_folder(folder)
+    if folder is None:
+        return
+    for name, mark in marked:
+        if (folder / name).is_file() and mark in (folder / name).read_bytes():
+            return
+    for name in names:
+        if (folder / name).exists():
+            text = f"cannot write {folder / name}: it is there and is something else"
+            raise JaxpendError(f"{text}; choose another folder")
+
+
+def check_apart(**files: Any) -> None:
+    """Refuse two options that name one file, other than "-"."""
+    first, second = files
+    one, other = (path and str(path) for path in files.values())
+    if one and other and one != "-" and os.path.realpath(one) == os.path.realpath(other):
+        raise JaxpendError(f"--{first} and --{second} are both {one}; name two files")
 
 
 def drop_unwritable() -> None:

@@ -71,6 +71,8 @@ def _described(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         return [_described(v, f"{path}.{i}".lstrip("."), arrays) for i, v in enumerate(value)]
     if value is None or isinstance(value, bool | int | float | str):
         return value
+    if isinstance(value, np.generic):  # a number of numpy in a static field
+        return value.item()
     if not hasattr(value, "dtype"):
         raise JaxpendError(f"{path} is {value!r}; a file can hold arrays, numbers and text only")
     arrays[path] = np.asarray(value)
@@ -183,7 +185,8 @@ def read_header(robot_or_path: str | Path) -> dict[str, Any]:
     """The JSON header of a policy or controller file. Raises as ``arrays.read_arrays``."""
     path = shipped(robot_or_path, "policies")
     header, _ = _read(path)
-    if header.get("robot") not in [*ROBOTS] or not isinstance(header.get("provenance", {}), dict):
+    known = header.get("robot") in [*ROBOTS] and header.get("kind", "controller") == "controller"
+    if not known or not isinstance(header.get("provenance", {}), dict):
         raise JaxpendError(f"{path} is not a policy file: its header does not say what it is of")
     return header
 

@@ -109,10 +109,11 @@ class Seen(Pytree):
 class KalmanFilter(Pytree):
     """Estimates the state from measurements of unknown noise; its memory is ``Seen``."""
 
+    COUNTS_CALLS: ClassVar = True
     plant: Plant  # the model; its torque limit clips what was asked for
     least: jax.Array  # (2,) rad and rad/s, the least noise of angles and of velocities
     disturbance: jax.Array  # () rad/s^2 per root second, how fast d wanders
-    dt: float = static(default=DT)  # s, between calls
+    dt: float = static(default=DT)  # s, between calls: what rolls it out sets it
 
     def reset(self) -> Seen:
         """Memory before the first measurement."""
@@ -195,9 +196,10 @@ class Observer(Pytree):
     its memory is (started, x, d, torque), its methods are those of ``KalmanFilter``.
     """
 
+    COUNTS_CALLS: ClassVar = True
     plant: Plant
     gain: jax.Array  # (3,) l1, l2 (1/s), l3 (1/s^2)
-    dt: float = static(default=DT)  # s, between calls
+    dt: float = static(default=DT)  # s, between calls: what rolls it out sets it
 
     def reset(self):
         return jnp.array(False), jnp.zeros(4), jnp.zeros(2), jnp.zeros(2)

@@ -1,11 +1,12 @@
 """Two controllers and a region: one swings up, the other holds the top; hysteresis between them."""
 
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from ..controller import Controller, check_controller
+from ..fields import Bounds, Positive, checked
 from ..plant import Plant, deviation
 from ..pytree import Pytree, pytree
 from ..stepping import Startable
@@ -92,8 +93,11 @@ def with_lqr(
 ) -> Hybrid:
     """``swingup`` with LQR at the top, switched by the ellipsoid where LQR does not saturate.
 
-    ``fraction`` and ``hysteresis`` are those of ``ellipsoid_of_torque``.
+    ``fraction`` and ``hysteresis`` are those of ``ellipsoid_of_torque``. Raises ``JaxpendError``
+    for a fraction that is not positive or a hysteresis below 1.
     """
+    fraction = checked(Positive, fraction, "fraction")
+    hysteresis = checked(Annotated[float, Bounds(least=1)], hysteresis, "hysteresis")
     check_controller(swingup)
     top = lqr(plant, robot)
     return Hybrid(swingup, top, ellipsoid_of_torque(top, fraction, hysteresis=hysteresis))

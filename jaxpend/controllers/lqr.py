@@ -98,10 +98,13 @@ def lqr(
 
     joint = active_joint(robot)
     weights = np.asarray(q, float)
-    if weights.shape != (4,) or not (weights >= 0).all() or not r > 0 or not (dt is None or dt > 0):
+    good = weights.shape == (4,) and (weights >= 0).all() and np.isfinite(weights).all()
+    if not good or not 0 < r < np.inf or not (dt is None or 0 < dt < np.inf):
         raise JaxpendError(f"LQR needs q of 4 values >= 0, r > 0 and dt > 0; got {q}, {r}, {dt}")
     dtype = jnp.result_type(plant.mass)
     a, b = _upright(plant, joint, dt)
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise JaxpendError(f"no LQR for this plant and dt = {dt}: its linear model is not finite")
     if not b.any():
         text = f"joint {joint + 1} of this plant has no motor, as the {robot} has"
         raise JaxpendError(f"no LQR: {text}")

@@ -20,6 +20,7 @@ import numpy as np
 
 from ..designs import active_joint
 from ..errors import JaxpendError
+from ..fields import Count, NotNegative, Positive, checked
 from ..plant import Plant, deviation, joint_torque
 from ..pytree import pytree, static
 from ..scenario import DT
@@ -167,6 +168,7 @@ def tracking_mpc(
     ``every`` or ``iterations`` that do not fit, and as ``lqr``.
     """
     _check(horizon, every, iterations, reference.steps)
+    _check_weights(q, r, smoothness)
     gain, cost_to_go, top = along(plant, reference, q=q, r=r)
     dtype = reference.x.dtype
     z = jnp.column_stack([reference.x, jnp.concatenate([jnp.zeros(1, dtype), reference.u])])
@@ -201,6 +203,9 @@ def free_mpc(
     ``MPC``. Raises ``JaxpendError`` as ``tracking_mpc``.
     """
     _check(horizon, every, iterations, horizon)
+    _check_weights(q, r, smoothness)
+    dt, starts = checked(Positive, dt, "dt"), checked(Count, starts, "starts")
+    first_iterations = checked(Count, first_iterations, "first_iterations")
     top = lqr(plant, robot, dt=dt)
     dtype = plant.mass.dtype
     zeros = jnp.zeros((horizon + 1, 5), dtype)
@@ -242,8 +247,18 @@ def _first_plan(mpc: MPC, key: jax.Array, starts: int, iterations: int) -> Solut
 
 
 def _check(horizon: int, every: int, iterations: int, longest: int) -> None:
+    for name, value in {"every": every, "horizon": horizon, "iterations": iterations}.items():
+        checked(int, value, name)
     if not (1 <= every < horizon <= longest and iterations >= 1):
         raise JaxpendError(
             f"MPC needs 1 <= every < horizon <= {longest} and iterations >= 1; "
             f"got every = {every}, horizon = {horizon}, iterations = {iterations}"
         )
+
+
+def _check_weights(q: tuple[float, ...], r: float, smoothness: float) -> None:
+    """Refuse weights that are no weights."""
+    weights = tuple(np.asarray(q).ravel().tolist())
+    checked(tuple[NotNegative, NotNegative, NotNegative, NotNegative], weights, "q")
+    checked(Positive, r, "r")
+    checked(NotNegative, smoothness, "smoothness")

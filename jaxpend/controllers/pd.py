@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from ..controller import Memoryless
 from ..designs import active_joint
+from ..fields import NotNegative, checked
 from ..plant import Plant, deviation
 from ..pytree import pytree
 from .search_space import FACTOR
@@ -34,8 +35,10 @@ class PD(Memoryless):
 def pd(plant: Plant, robot: str, *, kp: float = 10.0, kd: float = 1.0) -> PD:
     """PD that drives the actuated joint of ``robot`` to its angle at upright.
 
-    ``kp`` in N m/rad and ``kd`` in N m s/rad. Raises ``JaxpendError`` for an unknown robot.
+    ``kp`` in N m/rad and ``kd`` in N m s/rad. Raises ``JaxpendError`` for an unknown robot, or
+    gains that are negative or not finite.
     """
+    kp, kd = checked(NotNegative, kp, "kp"), checked(NotNegative, kd, "kd")
     limit = plant.torque_limit
     driven = jnp.arange(2) == active_joint(robot)
     upright = jnp.array([jnp.pi, 0.0], limit.dtype)

@@ -279,6 +279,14 @@ def _table(result: dict[str, Any]) -> str:
     return text.getvalue()
 
 
+def _is_result(path: Path) -> bool:
+    """Whether a file is a result of the robustness benchmark."""
+    try:
+        return "over_keys" in json.loads(path.read_text())
+    except (OSError, ValueError, TypeError):
+        return False
+
+
 def write_robustness(result: dict[str, Any], folder: Path) -> list[Path]:
     """Write picture, CSV and JSON of a result; with the other robot's JSON there, both.
 
@@ -290,7 +298,7 @@ def write_robustness(result: dict[str, Any], folder: Path) -> list[Path]:
     write_atomically(written[0], to_json(result, indent=2) + "\n")
     write_atomically(written[1], _table(result))
     found = [folder / f"{name}.json" for name in ("acrobot", "pendubot")]
-    both = [json.loads(path.read_text()) for path in found if path.exists()]
+    both = [json.loads(path.read_text()) for path in found if _is_result(path)]
     save(robustness_figure(both), written[2])
     if "map" in result:
         written.append(folder / f"{robot}_map.png")

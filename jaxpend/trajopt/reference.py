@@ -14,7 +14,7 @@ from ..pytree import Pytree, pytree, static
 from ..robots import ROBOTS, active_joint, shipped
 from ..scenario import DT
 
-__all__ = ["Reference", "load_reference", "save_reference"]
+__all__ = ["Reference", "check_target", "load_reference", "save_reference"]
 
 FORMAT = 1
 
@@ -57,6 +57,16 @@ def save_reference(path: str | Path, reference: Reference, provenance: dict[str,
     header["provenance"] = provenance
     arrays = {"x": np.asarray(reference.x, "f4"), "gain": np.asarray(reference.gain, "f4")}
     write_arrays(path, header, arrays | {"u": np.asarray(reference.u, "f8")})
+
+
+def check_target(path: Path) -> None:
+    """Raise ``JaxpendError`` for a file that is there and is no trajectory file."""
+    if path.is_file() and path.stat().st_size:
+        try:
+            load_reference(path)
+        except JaxpendError:
+            text = f"cannot write {path}: it is there and is no trajectory file"
+            raise JaxpendError(f"{text}; choose another name") from None
 
 
 def load_reference(robot_or_path: str | Path, *, robot: str | None = None) -> Reference:
