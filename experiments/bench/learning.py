@@ -4,9 +4,9 @@
 
 Ours is the SAC of ``make train``. SBX has the same environments, memory and random scenarios
 included, and every setting of the recipe that it knows; it knows no distribution of the value, no
-mirrored batches, no averaged actor, and its critics see what the policy sees. Compiling counts,
-judgements do not. A row is of three seeds; one that does not get there within the steps of the
-recipe counts with all of its time.
+mirrored batches, no noise that lasts, no averaged actor, and its critics see what the policy sees.
+Compiling counts, judgements do not. A row is of three seeds; one that does not get there within the
+steps of the recipe counts with all of its time.
 """
 
 import sys
