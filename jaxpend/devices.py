@@ -128,8 +128,9 @@ def split(function: Callable[..., Any], *same: Any) -> Callable[..., Any]:
 
     ``function`` takes ``same``, pytrees of arrays that all rows have in common, and then pytrees of
     arrays (n, ...); it gives pytrees of arrays (n, ...), and treats every row alone, as one made by
-    ``jax.vmap`` does. It must not close over what is traced: jax refuses ``zeros_like`` and the
-    like of that. Where the devices do not divide n, the last row is computed several times.
+    ``jax.vmap`` does. It must not close over traced values, which are for ``same``: jax refuses
+    operations such as ``zeros_like`` on them. Where the devices do not divide n, the last row is
+    computed several times.
     """
     size = _shares()
     if size == 1:

@@ -38,11 +38,12 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     has a name that ``TEMPORARY`` matches and nothing else has. A device or a pipe is written to,
     not replaced, and of a symbolic link what it points to is.
     """
-    path = Path(os.path.realpath(path))
+    path = Path(path)
     if path.exists() and not path.is_file() and not path.is_dir():
         with path.open("wb") as file:
             yield file
         return
+    path = Path(os.path.realpath(path))
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -212,8 +212,9 @@ def identify(
         window: s, the length of a piece that is simulated at once.
 
     Raises:
-        JaxpendError: a recording with gaps, too short ones, an unknown parameter, or some that
-            the recordings do not tell apart, or nothing that moves like them.
+        JaxpendError: a recording with gaps, too short ones, an unknown parameter, one that is not
+            positive where the search starts, some that the recordings do not tell apart, or
+            nothing that moves like them.
     """
     names = tuple(fitted)
     for name in names:

@@ -17,7 +17,9 @@ from typing import Any, Self, TypeVar, dataclass_transform
 import jax
 import jax.numpy as jnp
 
-__all__ = ["Pytree", "in_default", "pytree", "static"]
+from .fields import checked
+
+__all__ = ["Pytree", "check_constant", "in_default", "pytree", "static"]
 
 T = TypeVar("T")
 
@@ -41,6 +43,13 @@ def pytree(cls: type[T]) -> type[T]:
     if not hasattr(cls, "replace"):
         cls.replace = Pytree.replace  # type: ignore[attr-defined]
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
+
+
+def check_constant(hint: Any, value: Any, name: str) -> None:
+    """``fields.checked`` of a number, or of several in a tuple or array; not of what is traced."""
+    if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value)):
+        plain = jax.tree.map(lambda v: v.tolist() if hasattr(v, "tolist") else v, value)
+        checked(hint, plain, name)
 
 
 def in_default(tree: T) -> T:

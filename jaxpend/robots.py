@@ -1,5 +1,6 @@
 """The two robots."""
 
+import os
 from importlib import resources
 from pathlib import Path
 
@@ -24,7 +25,7 @@ def active_joint(robot: str) -> int:
 
 def shipped(robot_or_path: str | Path, folder: str) -> Path:
     """The file in ``folder`` that ships, by its name in ``SHIPPED``; else the path itself."""
-    if not isinstance(robot_or_path, str | Path):
+    if not isinstance(robot_or_path, str | os.PathLike):
         raise JaxpendError(f"{robot_or_path!r:.40} is no path, and no name of what ships")
     if str(robot_or_path) not in SHIPPED:
         return Path(robot_or_path)

@@ -194,6 +194,16 @@ def _closed_loop(
     return Trajectory(jnp.asarray(stamps.astype(dtype)), x, u, measured, command)
 
 
+def _check_types(*parts: Any) -> None:
+    """Refuse arrays of a precision that jax does not compute in any more."""
+    if jnp.result_type(float) == jnp.float64:
+        return
+    for leaf in jax.tree.leaves(parts):
+        if isinstance(leaf, jax.Array) and leaf.dtype in (jnp.float64, jnp.int64):
+            text = "the scenario or controller was made with jax_enable_x64 on, and it is off now"
+            raise JaxpendError(f"{text}; make both again, or leave it on")
+
+
 def _check(
     scenario: Scenario | Plant, controller: Controller, dt: float, delay_slots: int
 ) -> tuple[Scenario, Controller]:
@@ -202,6 +212,7 @@ def _check(
     if not isinstance(scenario, Scenario):
         raise JaxpendError(f"{scenario!r:.40} is no scenario; give a Scenario or a Plant")
     check_values(scenario)
+    _check_types(scenario, controller)
     if scenario.x0 is not None and (shape := jnp.shape(scenario.x0)) != (4,):
         text = f"x0 has shape {shape}; one rollout starts from (4,): vmap over batches of scenarios"
         raise JaxpendError(text)
@@ -243,7 +254,8 @@ def rollout(
     Raises:
         JaxpendError: dt or duration not positive, values that mean nothing (see
             ``check_values``), a delay longer than the buffer, what is no scenario or no
-            controller, or a torque of another shape.
+            controller, normals or a torque of another shape, or arrays of a precision that is
+            off now.
     """
     scenario, controller = _check(scenario, controller, dt, delay_slots)
     options = (dt, duration, integrator, delay_slots)
@@ -265,7 +277,10 @@ def final_state(
     integrator: Callable = rk4_step,
     delay_slots: int = SLOTS,
 ) -> jax.Array:
-    """Only the last true state of ``rollout``, shape (4,): no trajectory is kept in memory."""
+    """Only the last true state of ``rollout``, shape (4,): no trajectory is kept in memory.
+
+    Raises ``JaxpendError`` as ``rollout``.
+    """
     scenario, controller = _check(scenario, controller, dt, delay_slots)
     return _final_state(scenario, controller, key, dt, duration, integrator, delay_slots)
 

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .errors import JaxpendError, choose
-from .fields import Natural, NotNegative, checked
+from .fields import Natural, NotNegative, Positive, checked
 from .plant import Plant, friction_vector
-from .pytree import Pytree, pytree
+from .pytree import Pytree, check_constant, pytree
 from .resets import Resets
 
 __all__ = [
@@ -134,13 +134,11 @@ def random_pulses(
         JaxpendError: a value out of range, or more pulses than fit into the duration.
     """
     n = 2 * checked(Natural, per_joint, "per_joint")
-    distance = checked(NotNegative, distance, "distance")
-    for name, (low, high) in {"width": width, "amplitude": amplitude}.items():
-        if not 0 <= low <= high < np.inf or (name == "width" and low == 0):
-            least = "above 0" if name == "width" else "from 0 on"
-            raise JaxpendError(f"{name} is ({low}, {high}); it must be a range, {least}")
+    check_constant(tuple[Positive, Positive], width, "width")
+    check_constant(tuple[NotNegative, NotNegative], amplitude, "amplitude")
+    check_constant(NotNegative, distance, "distance")
     slack = (duration - (n + 1) * distance) / max(n, 1)
-    if n and slack < 0:
+    if n and not slack >= 0:
         raise JaxpendError(f"{n} pulses {distance} s apart do not fit into {duration} s")
     wait_key, joint_key, width_key, amplitude_key = jax.random.split(key, 4)
     centres = jnp.cumsum(distance + slack * jax.random.uniform(wait_key, (n,)))

@@ -239,7 +239,7 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
     Raises:
         JaxpendError: it is none of this board's runs: longer, or of another robot, or, where it
             must be regular, on another time grid or with torques beyond the limit; or it holds
-            numbers that are not finite, or time stamps that do not rise.
+            numbers that are not finite, or time stamps that go back.
     """
     task = board(judged_on).task
     t, x, u = (np.asarray(values, float) for values in (run.t, run.x, run.u))
@@ -249,8 +249,8 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
         raise JaxpendError(f"the run has {shapes}; it must have three or more (N,), (N, 4), (N, 2)")
     if not all(np.isfinite(values).all() for values in (t, x, u)):
         raise JaxpendError("the run holds numbers that are not finite")
-    if not (np.diff(t) > 0).all():
-        raise JaxpendError("the time stamps of the run do not rise")
+    if (np.diff(t) < 0).any():
+        raise JaxpendError("the time stamps of the run go back")
     if (last := float(t[-1])) > 1.01 * task.duration:
         raise JaxpendError(
             f"the run lasts {last:.7g} s; a run of this board lasts {task.duration:g}"
@@ -264,10 +264,8 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
         )
     driven, passive = (float(abs(u[:, joint]).max()) for joint in (task.joint, 1 - task.joint))
     if regular and task.spread is None and driven > 1.01 * task.torque_limit:
-        text = f"torques of up to {driven:.3g} N m; the motor of this board gives"
-        raise JaxpendError(
-            f"joint {task.joint + 1} has {text} {task.torque_limit:g} (a robot's: --hardware)"
-        )
+        text = f"torques of up to {driven:.3g} N m; this board allows {task.torque_limit:g} N m"
+        raise JaxpendError(f"joint {task.joint + 1} has {text} (a robot's: --hardware)")
     if passive > (1e-6 if regular else max(driven, PASSIVE)) and not task.resets:
         raise JaxpendError(
             f"joint {2 - task.joint} has torques of up to {passive:.3g} N m, but the {task.robot} "

@@ -21,20 +21,23 @@ __all__ = ["Startable", "Stepper", "called_every"]
 
 
 def called_every(controller: Any, dt: float) -> Any:
-    """A controller, or a part of one, whose observers count on being called every ``dt`` s.
+    """A controller, or a part of one, for calls every ``dt`` s.
 
-    Of the parts that are dataclasses those are changed that say ``COUNTS_CALLS``.
+    A part that depends on that, such as an observer, has a method of this name that says what it
+    is then; all else stays as it is.
     """
+    if (own := getattr(type(controller), "called_every", None)) is not None:
+        return own(controller, dt)
+    if type(controller) in (tuple, list):
+        parts = [called_every(part, dt) for part in controller]
+        same = all(new is old for new, old in zip(parts, controller, strict=True))
+        return controller if same else type(controller)(parts)
     if not dataclasses.is_dataclass(controller) or isinstance(controller, type):
         return controller
-    parts = {f.name: getattr(controller, f.name) for f in dataclasses.fields(controller)}
-    changed = {name: called_every(part, dt) for name, part in parts.items()}
-    if getattr(controller, "COUNTS_CALLS", False):
-        changed["dt"] = dt
-    changed = {name: part for name, part in changed.items() if part is not parts[name]}
-    if not changed or changed == {"dt": parts.get("dt")}:
-        return controller
-    return dataclasses.replace(controller, **changed)
+    fields = {f.name: getattr(controller, f.name) for f in dataclasses.fields(controller)}
+    changed = {name: called_every(part, dt) for name, part in fields.items()}
+    changed = {name: part for name, part in changed.items() if part is not fields[name]}
+    return dataclasses.replace(controller, **changed) if changed else controller
 
 
 def _strong(tree: Any) -> Any:

@@ -7,7 +7,7 @@ time and not by memory. Only final states leave it, and scores if asked for.
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +17,9 @@ from . import devices
 from .controller import Controller, check_controller
 from .criteria import EPSILON, HEIGHT, Criteria, criteria, score_v2, upright
 from .errors import JaxpendError
-from .fields import checked
+from .fields import Bounds, checked
 from .plant import Plant
-from .pytree import Pytree, pytree
+from .pytree import Pytree, check_constant, pytree
 from .rollout import final_state, rollout
 from .scenario import DT, DURATION, Scenario, check_values
 from .variations import numbers, vary
@@ -91,10 +91,7 @@ def _rows(scenarios: Scenario) -> int:
 def at_least_one(**counts: int) -> None:
     """Raise ``JaxpendError`` for a count below 1; it is known by its name."""
     for name, count in counts.items():
-        if count != int(count):
-            raise JaxpendError(f"{name} is {count}; it must be a whole number")
-        if count < 1:
-            raise JaxpendError(f"{name} is {count}; it must be at least 1")
+        checked(Annotated[int, Bounds(least=1)], count, name)
 
 
 def _plan(
@@ -259,7 +256,9 @@ def mildest_failure(
     fraction = np.asarray(jax.random.uniform(place_key, (samples, len(ranges))), float)
     # Uniform in severity: else almost all samples of many imperfections would be bad in one.
     fraction *= np.linspace(0, 1, samples)[:, None] / fraction.max(axis=1, keepdims=True)
-    ends = np.array([checked(Ends, pair, f"the range of {n}") for n, pair in ranges.items()])
+    for name, pair in ranges.items():
+        check_constant(Ends, pair, f"the range of {name}")
+    ends = np.array(list(ranges.values()), float)
     values = ends[:, 0] + fraction * (ends[:, 1] - ends[:, 0])
     changes = dict(zip(ranges, values.T, strict=True))
     outcome = _varied(scenario, controller, changes, draw_key, run_key, options)

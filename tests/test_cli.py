@@ -432,12 +432,12 @@ def test_a_platform_that_is_not_there_is_said():
         ("JAX_NUM_CPU_DEVICES", "0"): "JAX_NUM_CPU_DEVICES is '0', which jax cannot use here: ",
         ("JAX_NUM_CPU_DEVICES", "x"): "jax does not take a variable of the environment: ",
         ("JAX_ENABLE_X64", "maybe"): "jax does not take a variable of the environment: ",
-        ("MPLBACKEND", "nonsense"): "MPLBACKEND is 'nonsense', which matplotlib does not take: ",
+        ("MPLBACKEND", "x"): "MPLBACKEND is 'x', which matplotlib does not know; leave it unset",
     }
     for (name, value), words in said.items():
-        done = command("jaxpend score", **{name: value})
+        done = command("jaxpend robustness", **{name: value})
         assert done.returncode == 2
-        assert done.stderr.startswith(f"jaxpend score: {words}")
+        assert done.stderr.startswith(f"jaxpend robustness: {words}")
         assert done.stderr.count("\n") == 1
 
 

@@ -145,7 +145,7 @@ BAD_LQR = [
 
 @pytest.mark.parametrize("bad", BAD_LQR)
 def test_bad_weights_of_lqr_are_one_sentence(bad):
-    with pytest.raises(JaxpendError, match="LQR needs q of 4 values >= 0, r > 0"):
+    with pytest.raises(JaxpendError, match="LQR needs finite q of 4 values >= 0, r > 0"):
         lqr(designs.competition("acrobot"), "acrobot", **bad)
 
 

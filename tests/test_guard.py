@@ -17,6 +17,7 @@ from jaxpend.plant import mass_matrix, rk4_step
 from jaxpend.pytree import Pytree, pytree
 from jaxpend.robustness import strips
 from jaxpend.scenario import delay_steps
+from jaxpend.stepping import called_every
 from jaxpend.sweep import upright
 
 KEY = jax.random.key(0)
@@ -283,3 +284,11 @@ def test_the_observer_counts_on_the_period_at_which_it_is_called(dt):
     stepper = policy.start(dt=dt)
     torques = np.array([stepper.torque(x) for x in run.x_measured[:20]])
     np.testing.assert_allclose(torques, run.u_command[:20], atol=1e-4)
+
+
+def test_a_controller_in_a_tuple_is_called_at_the_period_too():
+    own = load_policy("pendubot").observer
+    assert called_every(own, own.dt) is own
+    assert called_every((own, [own], 1), 0.01)[1][0].dt == 0.01
+    older = Observer(own.plant, jnp.array([0.5, 40.0, 800.0]))
+    np.testing.assert_allclose(called_every(older, 0.004).gain, [0.5, 20.0, 200.0])

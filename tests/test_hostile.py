@@ -315,6 +315,11 @@ def test_a_pipe_is_written_to_and_not_replaced(tmp_path):
     assert os.read(reader, 10) == b"text"
     os.close(reader)
     assert pipe.is_fifo()
+    ends = os.pipe()
+    write_atomically(f"/dev/fd/{ends[1]}", "text")
+    assert os.read(ends[0], 10) == b"text"
+    for end in ends:
+        os.close(end)
 
 
 def test_a_plant_may_have_numbers_as_yaml_has_them(tmp_path):

@@ -420,7 +420,7 @@ def test_a_sweep_is_of_one_whole_batch():
     ):
         with refused(words):
             sweep(scenarios, Zero(), KEY, duration=0.02)
-    with refused("repetitions is 1.5; it must be a whole number"):
+    with refused("repetitions is 1.5; it must be an integer"):
         survey(PLANT, Zero(), {"m2": [0.5]}, KEY, repetitions=1.5)
     with refused("dt is 0.0; it must be positive"):
         vary(Scenario(PLANT), {"delay": [0.01]}, key=KEY, dt=0.0)

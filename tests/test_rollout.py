@@ -381,3 +381,10 @@ def test_what_is_no_scenario_is_refused(scenario, options, words):
     start = Scenario(competition("pendubot"))
     with refused(words):
         rollout(scenario(start), Zero(), jax.random.key(0), duration=0.02, **options)
+
+
+def test_arrays_of_a_precision_that_is_off_are_refused():
+    with jax.enable_x64(True):
+        wide = OpenLoop(jnp.zeros(1), jnp.zeros((1, 2)))
+    with refused("was made with jax_enable_x64 on, and it is off now"):
+        rollout(competition("pendubot"), wide, KEY, duration=0.02)

@@ -66,8 +66,16 @@ def test_absent_imperfections_are_not_leaves():
         ({"per_joint": -1}, "per_joint is -1; it must not be negative"),
         ({"per_joint": 9}, "18 pulses 1.0 s apart do not fit into 10.0 s"),
         ({"distance": -1.0}, "distance is -1.0; it must not be negative"),
-        ({"width": (-1.0, 0.0)}, "width is (-1.0, 0.0); it must be a range, above 0"),
-        ({"amplitude": (5.0, 0.5)}, "amplitude is (5.0, 0.5); it must be a range, from 0 on"),
+        (
+            {"width": (-1.0, 0.0)},
+            "width is (-1.0, 0.0); it must be 2 values, each",
+        ),
+        (
+            {"amplitude": (-5.0, 0.5)},
+            "amplitude is (-5.0, 0.5); it must be 2 values, each",
+        ),
+        ({"amplitude": 0.5}, "amplitude is 0.5; it must be 2 values"),
+        ({"duration": np.nan}, "6 pulses 1.0 s apart do not fit into nan s"),
     ],
 )
 def test_pulses_that_make_no_sense_are_refused(options, words):

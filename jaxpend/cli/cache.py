@@ -86,8 +86,7 @@ def _jax() -> Any:
 def check_platform() -> None:
     """Raise ``JaxpendError`` for devices, in the environment, that jax does not have here.
 
-    Unasked, jax would say so in the middle of whatever is the first to compute. So too for what
-    draws pictures.
+    Unasked, jax would say so in the middle of whatever is the first to compute.
     """
     jax = _jax()
     for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME", "JAX_NUM_CPU_DEVICES"):
@@ -98,9 +97,3 @@ def check_platform() -> None:
                 said = (str(error).strip() or "no reason given").splitlines()[0]
                 text = f"{name} is {os.environ[name]!r}, which jax cannot use here: {said}"
                 raise JaxpendError(text) from None
-    if os.environ.get("MPLBACKEND"):
-        try:
-            import matplotlib  # noqa: F401
-        except ValueError as error:
-            text = f"MPLBACKEND is {os.environ['MPLBACKEND']!r}, which matplotlib does not take"
-            raise JaxpendError(f"{text}: {str(error).splitlines()[0]:.120}") from None

@@ -96,7 +96,10 @@ def report(
         robustness: run the robustness benchmark too, seconds for every seed.
     """
     folder = out or (run if run.is_dir() else Path("runs") / run.stem)
-    check_results(folder, ["report.html", "report"], ("report.html", b"jaxpend</title>"))
+    drawn = [(f"report/{name}.png", b"\x89PNG") for name in ("learning", "swingup")]
+    mark = ("report.html", b"jaxpend</title>")
+    check_results(folder, ["report.html"], mark)
+    check_results(folder, ["report"], mark, *drawn)  # there first, where one was stopped
     from ..runs.reader import find, remarks
     from ..terminal import console
 

@@ -46,7 +46,8 @@ def check_file(path: str | Path | None, begins: tuple[bytes, ...] = ()) -> None:
         return
     if Path(path).is_dir():
         raise JaxpendError(f"cannot write {path}: it is a folder")
-    check_folder(Path(path).parent)
+    target = Path(path) if Path(path).exists() else Path(os.path.realpath(path))
+    check_folder(target.parent)
     if begins and Path(path).is_file():
         with Path(path).open("rb") as file:
             start = file.read(max(map(len, begins)))
@@ -72,11 +73,18 @@ def check_results(folder: Path | None, names: Iterable[str], *marked: tuple[str,
     """``check_folder``, and refuse files in it that are not of this program; None: no folder.
 
     Files of those names are of this program where one of the ``marked``, names and what such a
-    file holds, is there too.
+    file holds, is there too. The files are pictures among others, so that it is asked whether
+    matplotlib can be used.
     """
     check_folder(folder)
     if folder is None:
         return
+    if os.environ.get("MPLBACKEND"):
+        try:
+            import matplotlib  # noqa: F401
+        except ValueError:
+            text = f"MPLBACKEND is {os.environ['MPLBACKEND']!r}, which matplotlib does not know"
+            raise JaxpendError(f"{text}; leave it unset") from None
     for name, mark in marked:
         if (folder / name).is_file() and mark in (folder / name).read_bytes():
             return

@@ -23,9 +23,8 @@ import numpy as np
 
 from ..controller import Memoryless
 from ..designs import active_joint
-from ..fields import checked
 from ..plant import UPRIGHT, Plant, deviation, dynamics, mass_matrix, total_energy
-from ..pytree import pytree, static
+from ..pytree import check_constant, pytree, static
 from .search_space import FACTOR
 
 __all__ = ["EnergyShaping", "energy_shaping"]
@@ -81,11 +80,11 @@ def energy_shaping(
     """Energy shaping for ``robot``; ``gains`` (kp, kd, ke1, ke2, cap, kick), default tuned ones.
 
     ``surplus`` (J) is as in ``EnergyShaping``. Raises ``JaxpendError`` for an unknown robot, or
-    another number of gains.
+    gains that are not six finite numbers.
     """
     joint = active_joint(robot)
     if gains is not None:
-        gains = checked(tuple[float, float, float, float, float, float], gains, "gains")
+        check_constant(tuple[float, float, float, float, float, float], gains, "gains")
     dtype = plant.mass.dtype
     kp, kd, *ke, cap, kick = jnp.asarray(GAINS[robot] if gains is None else gains, dtype)
     more = None if surplus is None else jnp.asarray(surplus, dtype)

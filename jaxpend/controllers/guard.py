@@ -109,11 +109,14 @@ class Seen(Pytree):
 class KalmanFilter(Pytree):
     """Estimates the state from measurements of unknown noise; its memory is ``Seen``."""
 
-    COUNTS_CALLS: ClassVar = True
     plant: Plant  # the model; its torque limit clips what was asked for
     least: jax.Array  # (2,) rad and rad/s, the least noise of angles and of velocities
     disturbance: jax.Array  # () rad/s^2 per root second, how fast d wanders
-    dt: float = static(default=DT)  # s, between calls: what rolls it out sets it
+    dt: float = static(default=DT)  # s, between calls
+
+    def called_every(self, dt: float) -> "KalmanFilter":
+        """The same for calls every ``dt`` s."""
+        return self if dt == self.dt else self.replace(dt=dt)
 
     def reset(self) -> Seen:
         """Memory before the first measurement."""
@@ -165,7 +168,7 @@ def observer(
     disturbance: float = 300.0,
     dt: float = DT,
 ) -> KalmanFilter:
-    """The observer of a plant, called every ``dt`` s.
+    """The observer of a plant, called every ``dt`` s, until a rollout or a loop says how often.
 
     Args:
         plant: the model.
@@ -196,10 +199,16 @@ class Observer(Pytree):
     its memory is (started, x, d, torque), its methods are those of ``KalmanFilter``.
     """
 
-    COUNTS_CALLS: ClassVar = True
     plant: Plant
     gain: jax.Array  # (3,) l1, l2 (1/s), l3 (1/s^2)
-    dt: float = static(default=DT)  # s, between calls: what rolls it out sets it
+    dt: float = static(default=DT)  # s, between calls
+
+    def called_every(self, dt: float) -> "Observer":
+        """For calls every ``dt`` s, of which each corrects as much as it does now."""
+        if dt == self.dt:
+            return self
+        shorter = self.dt / dt
+        return self.replace(dt=dt, gain=self.gain * shorter ** jnp.arange(3))
 
     def reset(self):
         return jnp.array(False), jnp.zeros(4), jnp.zeros(2), jnp.zeros(2)

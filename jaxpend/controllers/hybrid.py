@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from ..controller import Controller, check_controller
-from ..fields import Bounds, Positive, checked
+from ..fields import Bounds, Positive
 from ..plant import Plant, deviation
-from ..pytree import Pytree, pytree
+from ..pytree import Pytree, check_constant, pytree
 from ..stepping import Startable
 from .lqr import LQR, lqr
 from .search_space import FACTOR
@@ -96,8 +96,8 @@ def with_lqr(
     ``fraction`` and ``hysteresis`` are those of ``ellipsoid_of_torque``. Raises ``JaxpendError``
     for a fraction that is not positive or a hysteresis below 1.
     """
-    fraction = checked(Positive, fraction, "fraction")
-    hysteresis = checked(Annotated[float, Bounds(least=1)], hysteresis, "hysteresis")
+    check_constant(Positive, fraction, "fraction")
+    check_constant(Annotated[float, Bounds(least=1)], hysteresis, "hysteresis")
     check_controller(swingup)
     top = lqr(plant, robot)
     return Hybrid(swingup, top, ellipsoid_of_torque(top, fraction, hysteresis=hysteresis))

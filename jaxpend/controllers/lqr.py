@@ -100,7 +100,9 @@ def lqr(
     weights = np.asarray(q, float)
     good = weights.shape == (4,) and (weights >= 0).all() and np.isfinite(weights).all()
     if not good or not 0 < r < np.inf or not (dt is None or 0 < dt < np.inf):
-        raise JaxpendError(f"LQR needs q of 4 values >= 0, r > 0 and dt > 0; got {q}, {r}, {dt}")
+        raise JaxpendError(
+            f"LQR needs finite q of 4 values >= 0, r > 0 and dt > 0; got {q}, {r}, {dt}"
+        )
     dtype = jnp.result_type(plant.mass)
     a, b = _upright(plant, joint, dt)
     if not (np.isfinite(a).all() and np.isfinite(b).all()):

@@ -22,7 +22,7 @@ from ..designs import active_joint
 from ..errors import JaxpendError
 from ..fields import Count, NotNegative, Positive, checked
 from ..plant import Plant, deviation, joint_torque
-from ..pytree import pytree, static
+from ..pytree import check_constant, pytree, static
 from ..scenario import DT
 from ..stepping import Startable
 from ..trajopt.ilqr import Problem, Solution, iterate, solve, warm_start
@@ -165,7 +165,7 @@ def tracking_mpc(
     """MPC that stabilises a swing-up and then the top; ``horizon`` in steps of its ``dt``.
 
     The other arguments are as in ``tvlqr`` and ``MPC``. Raises ``JaxpendError`` for a horizon,
-    ``every`` or ``iterations`` that do not fit, and as ``lqr``.
+    ``every`` or ``iterations`` that do not fit, weights that are negative, and as ``lqr``.
     """
     _check(horizon, every, iterations, reference.steps)
     _check_weights(q, r, smoothness)
@@ -200,7 +200,8 @@ def free_mpc(
 
     The plan from hanging is the best of ``starts`` random sinusoids (drawn from ``key``, default
     ``jax.random.key(0)``), each optimised for ``first_iterations``; the other arguments are as in
-    ``MPC``. Raises ``JaxpendError`` as ``tracking_mpc``.
+    ``MPC``. Raises ``JaxpendError`` as ``tracking_mpc``, and for a dt, ``starts`` or
+    ``first_iterations`` that is not positive.
     """
     _check(horizon, every, iterations, horizon)
     _check_weights(q, r, smoothness)
@@ -258,7 +259,6 @@ def _check(horizon: int, every: int, iterations: int, longest: int) -> None:
 
 def _check_weights(q: tuple[float, ...], r: float, smoothness: float) -> None:
     """Refuse weights that are no weights."""
-    weights = tuple(np.asarray(q).ravel().tolist())
-    checked(tuple[NotNegative, NotNegative, NotNegative, NotNegative], weights, "q")
-    checked(Positive, r, "r")
-    checked(NotNegative, smoothness, "smoothness")
+    check_constant(tuple[NotNegative, NotNegative, NotNegative, NotNegative], q, "q")
+    check_constant(Positive, r, "r")
+    check_constant(NotNegative, smoothness, "smoothness")

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 
 from ..controller import Memoryless
 from ..designs import active_joint
-from ..fields import NotNegative, checked
+from ..fields import NotNegative
 from ..plant import Plant, deviation
-from ..pytree import pytree
+from ..pytree import check_constant, pytree
 from .search_space import FACTOR
 
 __all__ = ["PD", "pd"]
@@ -38,7 +38,8 @@ def pd(plant: Plant, robot: str, *, kp: float = 10.0, kd: float = 1.0) -> PD:
     ``kp`` in N m/rad and ``kd`` in N m s/rad. Raises ``JaxpendError`` for an unknown robot, or
     gains that are negative or not finite.
     """
-    kp, kd = checked(NotNegative, kp, "kp"), checked(NotNegative, kd, "kd")
+    check_constant(NotNegative, kp, "kp")
+    check_constant(NotNegative, kd, "kd")
     limit = plant.torque_limit
     driven = jnp.arange(2) == active_joint(robot)
     upright = jnp.array([jnp.pi, 0.0], limit.dtype)

@@ -25,6 +25,7 @@ from ..files import write_atomically
 from ..leaderboard import judge
 from ..plant import Plant
 from ..robustness import CRITERIA
+from ..stepping import called_every
 from .numpy import source
 
 __all__ = ["check_target", "export", "submission", "write"]
@@ -212,7 +213,7 @@ def write(
     """
     name, folder = check_target(folder), Path(folder)
     with jax.enable_x64(True):
-        controller = make(board.task.plant)
+        controller = called_every(make(board.task.plant), board.task.dt)
         check_robot(controller, board.robot)
         source(controller)  # what cannot be written is known before it is judged
     found = judge(make, board, **options)

@@ -144,8 +144,9 @@ def write_hardware(result: dict[str, Any], folder: Path) -> Path:
     figure.axes[0].legend()
     path = folder / f"{result['preset']}_{result['robot']}.png"
     folder.mkdir(parents=True, exist_ok=True)
-    save(figure, path)
+    # The numbers first: by them the next call knows the picture.
     write_atomically(path.with_suffix(".json"), to_json(result, indent=2) + "\n")
+    save(figure, path)
     return path
 
 
