@@ -18,10 +18,17 @@ __all__ = ["read_arrays", "write_arrays"]
 def write_arrays(
     path: str | Path, header: dict[str, Any], arrays: Mapping[str, Any], *, compressed: bool = True
 ) -> None:
-    """Write a file of named arrays and a header that JSON can hold, atomically."""
+    """Write a file of named arrays and a header that JSON can hold, atomically.
+
+    Raises ``JaxpendError`` for a header that JSON cannot hold.
+    """
+    try:
+        text = json.dumps(header)
+    except (TypeError, ValueError) as error:
+        raise JaxpendError(f"cannot write {path}: what it should say of itself: {error}") from None
     save = np.savez_compressed if compressed else np.savez
     with replacing(path) as file:
-        save(file, header=np.array(json.dumps(header)), **arrays)
+        save(file, header=np.array(text), **arrays)
 
 
 def read_arrays(path: Path, what: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

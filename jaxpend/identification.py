@@ -62,6 +62,11 @@ class Identified:
 def _checked(number: int, run: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times (N,), states (N, 4) and torques (N, 2) of a recording."""
     t, x, u = (np.asarray(values, float) for values in (run.t, run.x, run.u))
+    if t.ndim != 1 or x.shape[1:] != (4,) or u.shape[1:] != (2,) or len(x) < len(t):
+        shapes = f"t {t.shape}, x {x.shape}, u {u.shape}"
+        raise JaxpendError(f"recording {number} has {shapes}; it must have (N,), (N, 4), (N, 2)")
+    if not all(np.isfinite(values).all() for values in (t, x, u)):
+        raise JaxpendError(f"recording {number} holds numbers that are not finite")
     count = min(len(t), len(u))
     t, x, u = t[:count], x[:count].copy(), u[:count]
     steps = np.diff(t)

@@ -213,6 +213,8 @@ def test_what_is_no_path_is_one_sentence(tmp_path):
     for value in (None, 5):
         with refused(f"{value} is no path, and no name of what ships"):
             load_policy(value)
+    with refused("cannot write policy.npz: what it should say of itself: Object of type set"):
+        save_policy("policy.npz", load_policy("pendubot"), {"seed": {1, 2}})
     with pytest.raises(IsADirectoryError) as error:
         save_policy(tmp_path, load_policy("pendubot"))
     assert error.value.filename == str(tmp_path)

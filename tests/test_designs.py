@@ -83,6 +83,7 @@ def test_yaml_file(tmp_path):
         (lambda: designs.competition("cartpole"), "robot 'cartpole'; known: acrobot, pendubot"),
         (lambda: designs.competition("acrobot", 0.0), "torque limit is 0.0 N m"),
         (lambda: designs.competition("acrobot", float("nan")), "torque limit is nan"),
+        (lambda: designs.competition("acrobot", "6"), "torque limit is '6' N m; it must be"),
         (lambda: designs.from_dict({"m1": 1.0}), "lack m2, l1"),
         (lambda: designs.from_dict(OWN | {"mass": 1}), "plant parameter 'mass'"),
         (lambda: designs.from_dict(OWN | {"m1": "heavy"}), "m1 is 'heavy'; it must be a number"),

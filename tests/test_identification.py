@@ -87,6 +87,15 @@ def test_what_says_nothing_is_refused(recordings):
         identify([still], NOMINAL, ("r1", "delay"))
     with refused("no plant was found that moves like the recordings"):
         identify([run.replace(x=run.x[::-1].copy())], NOMINAL, ("r1",), window=1.0)
+    for change, words in (
+        ({"x": run.x[:, :2]}, "it must have (N,), (N, 4), (N, 2)"),
+        ({"u": run.u[:, 0]}, "it must have (N,), (N, 4), (N, 2)"),
+        ({"x": np.full_like(run.x, np.nan)}, "recording 1 holds numbers that are not finite"),
+    ):
+        with refused(words):
+            identify([run.replace(**change)], NOMINAL)
+    with refused("g is 0 where the search starts; to be fitted it must be positive"):
+        identify([run], {**NOMINAL, "g": 0.0}, ("g",))
     with refused("unknown parameter to identify 'tl1'"):
         identify([run], NOMINAL, ("tl1",))
     for names in ((), ("r1", "r1")):

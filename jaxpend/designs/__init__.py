@@ -88,8 +88,10 @@ def from_dict(
         actuation = np.arange(2) == active_joint(robot)
         limit = np.where(actuation, limit, 0.0)
     if torque_limit is not None:
-        if not torque_limit > 0:
-            raise JaxpendError(f"torque limit is {torque_limit} N m; it must be positive")
+        if isinstance(torque_limit, str) or not torque_limit > 0:
+            raise JaxpendError(
+                f"torque limit is {torque_limit!r} N m; it must be a positive number"
+            )
         limit = np.where(actuation, torque_limit, 0.0)
     values: dict[str, Any] = {k: [p[f"{v}1"], p[f"{v}2"]] for k, v in PAIRS.items()}
     values |= {"torque_limit": limit, "actuation": actuation, "gravity": p["g"]}
