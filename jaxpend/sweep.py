@@ -141,7 +141,7 @@ def sweep(
         JaxpendError: what is no batch, values that mean nothing (see ``check_values``), what is
             no controller, or a chunk below 1.
     """
-    _rows(scenarios)
+    n = _rows(scenarios)
     check_values(scenarios)
     check_controller(controller)
     pieces, static = _plan(
@@ -149,7 +149,6 @@ def sweep(
         chunk=chunk,
     )  # fmt: skip
     outcomes = [devices.compute(_run, piece, controller, keys, **static) for piece, keys in pieces]
-    n = _rows(scenarios)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:n], *outcomes)
 
 

@@ -276,9 +276,10 @@ def test_nonsense_is_refused_and_nothing_is_added_for_nothing():
         guard(main, "cartpole")
 
 
+@both_robots
 @pytest.mark.parametrize("dt", [0.001, 0.005, 0.01])
-def test_the_observer_counts_on_the_period_at_which_it_is_called(dt):
-    policy, plant = load_policy("pendubot"), designs.competition("pendubot")
+def test_the_observer_counts_on_the_period_at_which_it_is_called(robot, dt):
+    policy, plant = load_policy(robot), designs.competition(robot)
     run = rollout(plant, policy, KEY, dt=dt, duration=5.0)
     assert upright(run.x[-1])
     stepper = policy.start(dt=dt)

@@ -77,6 +77,9 @@ def template(tmp_path_factory):
     np.savez(folder / "pickled.npz", header=np.array({"a": 1}, dtype=object))
     with np.load(shipped / "acrobot.npz") as file:
         arrays = dict(file)
+    (folder / "drawn/report").mkdir(parents=True)
+    (folder / "drawn/report/swingup.png").write_bytes(b"\x89PNG mine")
+    (folder / "pendubot").write_bytes(b"PK mine")
     for name in ("site/report.html", "results/pendubot.csv", "results/identified_pendubot.png"):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text("mine")
@@ -190,6 +193,12 @@ CASES = [
      "cannot write results/identified_pendubot.png: it is there and is something else"),
     ("report acrobot_file.npz --out site",
      "cannot write site/report.html: it is there and is something else"),
+    ("report acrobot_file.npz --out drawn",
+     "cannot write drawn/report: it is there and is something else"),
+    ("optimise --robot pendubot --out pendubot",
+     "cannot write pendubot: it is there and is no trajectory file"),
+    ("import own.py --robot pendubot --preset evolsac --out pendubot",
+     "cannot write pendubot: it is there and is no policy file"),
     ("identify own.py --out new --json new", "--json and --out are both new; name two files"),
     # Configurations.
     ("sac --config .", "cannot read .: Is a directory"),

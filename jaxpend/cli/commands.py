@@ -96,7 +96,7 @@ def report(
         robustness: run the robustness benchmark too, seconds for every seed.
     """
     folder = out or (run if run.is_dir() else Path("runs") / run.stem)
-    drawn = [(f"report/{name}.png", b"\x89PNG") for name in ("learning", "swingup")]
+    drawn = [(f"report/{name}.png", b"Software\0jaxpend") for name in ("learning", "swingup")]
     mark = ("report.html", b"jaxpend</title>")
     check_results(folder, ["report.html"], mark)
     check_results(folder, ["report"], mark, *drawn)  # there first, where one was stopped

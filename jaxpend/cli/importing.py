@@ -81,7 +81,7 @@ def _check_out(out: Path) -> None:
         from ..controllers.files import read_header
 
         try:
-            read_header(out)
+            read_header(out.absolute())  # not what ships by that name
         except JaxpendError:
             text = f"cannot write {out}: it is there and is no policy file; choose another name"
             raise JaxpendError(text) from None

@@ -73,7 +73,7 @@ def save(figure: Figure, path: Path) -> None:
     with warnings.catch_warnings():
         # A name may have characters that the font does not have; boxes stand for them.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
-        figure.savefig(buffer, format="png", dpi=150)
+        figure.savefig(buffer, format="png", dpi=150, metadata={"Software": "jaxpend"})
     write_atomically(path, buffer.getvalue())
 
 

@@ -63,7 +63,7 @@ def check_target(path: Path) -> None:
     """Raise ``JaxpendError`` for a file that is there and is no trajectory file."""
     if path.is_file() and path.stat().st_size:
         try:
-            load_reference(path)
+            load_reference(path.absolute())  # not what ships by that name
         except JaxpendError:
             text = f"cannot write {path}: it is there and is no trajectory file"
             raise JaxpendError(f"{text}; choose another name") from None
