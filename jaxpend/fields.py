@@ -31,11 +31,14 @@ __all__ = [
     "Bounds",
     "Checked",
     "Count",
+    "Duration",
     "Natural",
     "NotNegative",
     "Period",
     "Positive",
+    "PositiveOrInfinite",
     "Preset",
+    "Rate",
     "Robot",
     "Scale",
     "Seed",
@@ -79,12 +82,15 @@ class Bounds:
 Count = Annotated[int, Bounds(above=0)]
 Natural = Annotated[int, Bounds(least=0)]
 Positive = Annotated[float, Bounds(above=0)]
+PositiveOrInfinite = Annotated[float, Bounds(above=0, infinite=True)]
 NotNegative = Annotated[float, Bounds(least=0)]
 # Of what is multiplied with float32 numbers, which would be infinite or 0 where it is beyond them.
 Scale = Annotated[float, Bounds(above=0, least=1e-9, most=1e9)]
 SLOWEST = 1.0  # s, the longest control period of a policy
 Period = Annotated[float, Bounds(above=0, most=SLOWEST)]
+Duration = Annotated[float, Bounds(least=0.01, most=3600)]  # s
 Share = Annotated[float, Bounds(least=0, most=1)]
+Rate = Annotated[float, Bounds(above=0, most=1)]
 # Keys of jax are made of 32 bits; the largest seed is for scenarios that no run trains on.
 Seed = Annotated[int, Bounds(least=0, below=LARGEST)]
 Robot = Literal["acrobot", "pendubot"]

@@ -1,0 +1,25 @@
+"""What can be configured: frozen plain dataclasses that load without jax.
+
+The type of a field says which values it may have (``fields``); all raise ``JaxpendError`` for
+values that make no sense.
+"""
+
+from ..observation import Observation
+from .learning import (
+    ACTIVATIONS,
+    Activation,
+    DemonstrationConfig,
+    EnvConfig,
+    Objective,
+    Reward,
+    SACConfig,
+)
+from .runs import CheckpointConfig, GradientRun, Run, SACRun, SearchRun, SNESRun, TrainRun
+from .searches import GradientConfig, GuardConfig, OpeningsConfig, Search, SNESConfig, Strategy
+
+__all__ = [
+    "ACTIVATIONS", "Activation", "CheckpointConfig", "DemonstrationConfig", "EnvConfig",
+    "GradientConfig", "GradientRun", "GuardConfig", "Objective", "Observation", "OpeningsConfig",
+    "Reward", "Run", "SACConfig", "SACRun", "SNESConfig", "SNESRun", "Search", "SearchRun",
+    "Strategy", "TrainRun",
+]  # fmt: skip
