@@ -42,8 +42,10 @@ __all__ = [
     "EnvState",
     "Reward",
     "World",
+    "anywhere",
     "restarted",
     "surrogate_reward",
+    "thrown_states",
     "truncated",
 ]
 
@@ -110,8 +112,14 @@ def _among(share: float, others: float) -> float:
     return min(share / (1 - others), 1.0) if others < 1 else 0.0
 
 
+def anywhere(key_angles: jax.Array, key_speeds: jax.Array) -> jax.Array:
+    """A state (4,) with uniform angles and normal velocities; both keys are consumed."""
+    angles = jax.random.uniform(key_angles, (2,), minval=-jnp.pi, maxval=jnp.pi)
+    return jnp.concatenate([angles, START_SPEED * jax.random.normal(key_speeds, (2,))])
+
+
 @functools.cache
-def _thrown_states(task: Task) -> np.ndarray:
+def thrown_states(task: Task) -> np.ndarray:
     """States (THROWN, 4) in which resets by hand leave the arm: a table, since one takes long."""
     with jax.ensure_compile_time_eval():
         plant = task.with_resets(Scenario(task.plant), None).plant
@@ -187,14 +195,12 @@ class Env:
             # Among the episodes that do not start near upright, so that both shares are right.
             share = _among(share, config.upright_starts)
             key_where, key_angles, key_speeds = jax.random.split(jax.random.fold_in(key, 2), 3)
-            angles = jax.random.uniform(key_angles, (2,), minval=-jnp.pi, maxval=jnp.pi)
-            speeds = START_SPEED * jax.random.normal(key_speeds, (2,))
-            anywhere = jax.random.bernoulli(key_where, share) & ~jnp.any(x)
-            x = jnp.where(anywhere, jnp.concatenate([angles, speeds]), x)
+            chosen = jax.random.bernoulli(key_where, share) & ~jnp.any(x)
+            x = jnp.where(chosen, anywhere(key_angles, key_speeds), x)
         if share := config.thrown_starts:
             share = _among(share, config.upright_starts + config.random_starts)
             key_where, key_which = jax.random.split(jax.random.fold_in(key, 3))
-            states = jnp.asarray(_thrown_states(self.task), x.dtype)
+            states = jnp.asarray(thrown_states(self.task), x.dtype)
             state = states[jax.random.randint(key_which, (), 0, THROWN)]
             x = jnp.where(jax.random.bernoulli(key_where, share) & ~jnp.any(x), state, x)
         return x

@@ -83,17 +83,20 @@ def push(resets: Resets, hand: Hand, plant: Plant, k: jax.Array, x: jax.Array):
     return holds, hand, torque
 
 
-def thrown(plant: Plant, key: jax.Array, dt: float) -> jax.Array:
-    """The state (4,) in which a reset leaves an arm that stood; ``key`` is consumed.
+def thrown(plant: Plant, key: jax.Array, dt: float, x: jax.Array | None = None) -> jax.Array:
+    """The state (4,) in which a reset leaves an arm in state ``x`` (4,); ``key`` is consumed.
 
-    ``plant`` has both joints driven. The joints may be whole turns off (``TURNS``), as swing-ups
-    leave them, so that the hand, which does not wrap angles, turns them back and throws harder.
+    ``plant`` has both joints driven. Without a state it is an arm that stood; its joints may then
+    be whole turns off (``TURNS``), as swing-ups leave them, so that the hand, which does not wrap
+    angles, turns them back and throws harder.
     """
     key_side, key_turns, key_error, key_target = jax.random.split(key, 4)
-    side = jnp.where(jax.random.bernoulli(key_side), 1.0, -1.0)
-    turns = jax.random.categorical(key_turns, jnp.log(jnp.asarray(TURNS)))
-    turns = turns * side * jnp.array([1.0, -1.0])
-    x = jnp.pi * jnp.concatenate([turns * 2 + side * jnp.array([1.0, 0.0]), jnp.zeros(2)])
+    if x is None:
+        side = jnp.where(jax.random.bernoulli(key_side), 1.0, -1.0)
+        turns = jax.random.categorical(key_turns, jnp.log(jnp.asarray(TURNS)))
+        turns = turns * side * jnp.array([1.0, -1.0])
+        angles = jnp.pi * (turns * 2 + side * jnp.array([1.0, 0.0]))
+        x = jnp.concatenate([angles, jnp.zeros(2)])
     target = jax.random.uniform(key_target, (1, 2), minval=-jnp.pi, maxval=jnp.pi)
     error = jax.random.uniform(key_error, (2,), minval=-2 * jnp.pi, maxval=2 * jnp.pi)
     steps = round(HOLD / dt)

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from conftest import shipped_network, task_of
 
-from jaxpend import devices, gradient, snes
+from jaxpend import devices, gradient, load_policy, shac, snes
 from jaxpend.boards import BOARDS
-from jaxpend.config import GradientConfig, Objective, SACConfig, SNESConfig
+from jaxpend.config import GradientConfig, Objective, SACConfig, SHACConfig, SNESConfig
 from jaxpend.controller import Memoryless
 from jaxpend.controllers.callback import realaigym
 from jaxpend.controllers.search_space import FACTOR
@@ -96,6 +96,17 @@ def doors():
     ]  # fmt: skip
 
 
+def windows():
+    """Two steps of the short-horizon actor-critic, with five arms, which 3 and 8 do not divide."""
+    config = SHACConfig(
+        steps=3, critic_steps=1, num_arms=5, window=0.05, critic_hidden=(8,), critic_updates=1
+    )
+    policy, task = load_policy("global_pendubot"), BOARDS["v3"]["pendubot"].task
+    state = shac.init(config, policy, KEY, task)
+    state, _ = devices.compute(partial(shac.improve, config, steps=2, task=task), policy, state)
+    return [*state.parameters[:99].tolist(), *state.x.ravel().tolist()]
+
+
 def split():
     """Sums over rows of a function that is split, within a vmap, a gradient and another split."""
     rows, weights = jnp.arange(11.0).reshape(11, 1), jnp.array([1.0, 2.0])
@@ -148,6 +159,7 @@ def main(folder: Path) -> None:
         found[count] |= {
             "python": swept(realaigym(Counting())).tolist(),
             "doors": doors(),
+            "windows": windows(),
             "exchanged": exchanged(),
             "sac": learned(folder / str(count)),
         }

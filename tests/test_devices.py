@@ -26,7 +26,7 @@ def found(tmp_path_factory):
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("what", ["split", "sweep", "doors", "sac"])
+@pytest.mark.parametrize("what", ["split", "sweep", "doors", "windows", "sac"])
 def test_any_number_of_devices_computes_the_same(found, what):
     for count in {"3", "8"} & {n for n, parts in found.items() if what in parts}:
         one, many = (np.hstack(found[n][what]) for n in ("1", count))

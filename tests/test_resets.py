@@ -18,7 +18,7 @@ from jaxpend.controllers.callback import realaigym
 from jaxpend.controllers.files import load_policy
 from jaxpend.controllers.mpc import free_mpc
 from jaxpend.controllers.policy import network_in
-from jaxpend.env import Env, _thrown_states
+from jaxpend.env import Env, thrown_states
 from jaxpend.gradient import Gradient
 from jaxpend.pytree import pytree
 from jaxpend.resets import Resets, held, official_resets, random_resets, stamps, thrown
@@ -190,7 +190,7 @@ def test_a_share_of_episodes_starts_as_a_reset_leaves_the_arm():
     hanging = (x == 0).all(axis=1)
     up = (np.abs(x - [np.pi, 0, 0, 0]) < 1e-4).all(axis=1)
     np.testing.assert_allclose([hanging.mean(), up.mean()], 0.25, atol=0.03)
-    table = np.asarray(_thrown_states(env.task))
+    table = np.asarray(thrown_states(env.task))
     assert (np.abs(table[:, None, 2:]).max(axis=0) > 15).all()
     for state in x[~hanging & ~up][:20]:
         assert (np.abs(table - state).max(axis=1) < 1e-5).any()

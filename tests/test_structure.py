@@ -30,7 +30,7 @@ trajopt.search leaderboard
 stage retention
 env
 sac
-snes gradient openings
+snes gradient shac openings
 runs
 train
 report

@@ -42,6 +42,11 @@ COMMANDS = {
         "the gradient of the smooth score, from a policy or any other controller",
         "--robot acrobot --policy runs/mine/sac_best.npz --gradient.steps 1000",
     ),
+    "shac": Command(
+        "train a policy",
+        "the gradient in short windows with a critic, from a policy of the v3 board",
+        "--board v3 --robot pendubot --policy runs/mine/sac_best.npz",
+    ),
     "snes": Command(
         "train a policy",
         "SNES on the official score, from a policy or any other controller",

@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-from ..config import GradientRun, Run, SACRun, Search, SNESRun, TrainRun
+from ..config import GradientRun, Run, SACRun, Search, SHACRun, SNESRun, TrainRun
 from ..errors import JaxpendError
 from ..fields import BoardName, Count, Natural, Robot, Seed
 from .benchmarking import robustness as robustness
@@ -25,7 +25,7 @@ def train(config: TrainRun, command: str) -> None:
     """The stages of training that a recipe has; ends with the official score.
 
     They are imitation, where it has demonstrations; SAC; other ways to begin, where it has a count
-    of openings; the gradient, where it has steps; SNES, where it has generations.
+    of openings; the gradient and SHAC, where they have steps; SNES, where it has generations.
     """
     execute(config, command)
 
@@ -37,6 +37,11 @@ def sac(config: SACRun, command: str) -> None:
 
 def gradient(config: GradientRun, command: str) -> None:
     """The gradient of the smooth score, from a policy or any other controller, in a run folder."""
+    execute(config, command)
+
+
+def shac(config: SHACRun, command: str) -> None:
+    """The short-horizon actor-critic, from a policy of the v3 board, in a run folder."""
     execute(config, command)
 
 

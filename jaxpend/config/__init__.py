@@ -14,12 +14,20 @@ from .learning import (
     Reward,
     SACConfig,
 )
-from .runs import CheckpointConfig, GradientRun, Run, SACRun, SearchRun, SNESRun, TrainRun
-from .searches import GradientConfig, GuardConfig, OpeningsConfig, Search, SNESConfig, Strategy
+from .runs import CheckpointConfig, GradientRun, Run, SACRun, SearchRun, SHACRun, SNESRun, TrainRun
+from .searches import (
+    GradientConfig,
+    GuardConfig,
+    OpeningsConfig,
+    Search,
+    SHACConfig,
+    SNESConfig,
+    Strategy,
+)
 
 __all__ = [
     "ACTIVATIONS", "Activation", "CheckpointConfig", "DemonstrationConfig", "EnvConfig",
     "GradientConfig", "GradientRun", "GuardConfig", "Objective", "Observation", "OpeningsConfig",
-    "Reward", "Run", "SACConfig", "SACRun", "SNESConfig", "SNESRun", "Search", "SearchRun",
-    "Strategy", "TrainRun",
+    "Reward", "Run", "SACConfig", "SACRun", "SHACConfig", "SHACRun", "SNESConfig", "SNESRun",
+    "Search", "SearchRun", "Strategy", "TrainRun",
 ]  # fmt: skip

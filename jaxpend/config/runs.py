@@ -7,10 +7,11 @@ from typing import Annotated, Literal
 from ..errors import JaxpendError
 from ..fields import LARGEST, BoardName, Bounds, Checked, Count, Natural, Preset, Robot, Seed
 from .learning import SACConfig
-from .searches import GradientConfig, GuardConfig, OpeningsConfig, SNESConfig
+from .searches import GradientConfig, GuardConfig, OpeningsConfig, SHACConfig, SNESConfig
 
 __all__ = [
-    "CheckpointConfig", "GradientRun", "Run", "SACRun", "SNESRun", "SearchRun", "TrainRun",
+    "CheckpointConfig", "GradientRun", "Run", "SACRun", "SHACRun", "SNESRun", "SearchRun",
+    "TrainRun",
 ]  # fmt: skip
 
 
@@ -64,7 +65,8 @@ class Run(Checked):
     def folder(self) -> Path:
         """Path of the run folder."""
         # A stage alone must not land in the folder of the whole run that it may start from.
-        stage = {SACRun: "-sac", GradientRun: "-gradient", SNESRun: "-snes"}.get(type(self), "")
+        stages = {SACRun: "-sac", GradientRun: "-gradient", SHACRun: "-shac", SNESRun: "-snes"}
+        stage = stages.get(type(self), "")
         seeds = f"s{self.seed}-{self.seed + self.seeds - 1}" if self.seeds > 1 else str(self.seed)
         task = "" if self.board == "v2" else f"-{self.board}"
         task += "" if self.preset == "identified" else f"-{self.preset}"
@@ -106,6 +108,18 @@ class GradientRun(SearchRun):
 
 
 @dataclasses.dataclass(frozen=True)
+class SHACRun(SearchRun):
+    """The short-horizon actor-critic alone."""
+
+    shac: SHACConfig = dataclasses.field(default_factory=SHACConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.shac.steps:
+            raise JaxpendError("shac.steps is 0; a run of it alone needs some")
+
+
+@dataclasses.dataclass(frozen=True)
 class SNESRun(SearchRun):
     """SNES alone."""
 
@@ -114,10 +128,11 @@ class SNESRun(SearchRun):
 
 @dataclasses.dataclass(frozen=True)
 class TrainRun(SACRun):
-    """SAC; from its best policies openings, the gradient, and SNES, guarded, where they are on."""
+    """SAC; from its best policies openings, the gradient, SHAC, and SNES, guarded, if on."""
 
     openings: OpeningsConfig = dataclasses.field(default_factory=OpeningsConfig)
     gradient: GradientConfig = dataclasses.field(default_factory=lambda: GradientConfig(steps=0))
+    shac: SHACConfig = dataclasses.field(default_factory=lambda: SHACConfig(steps=0))
     guard: GuardConfig = dataclasses.field(default_factory=GuardConfig)
     snes: SNESConfig = dataclasses.field(default_factory=SNESConfig)
 

@@ -11,14 +11,18 @@ from ..fields import (
     Duration,
     Natural,
     NotNegative,
+    Period,
     Positive,
     PositiveOrInfinite,
+    Rate,
     Seed,
+    Share,
 )
 from .learning import Objective
 
 __all__ = [
-    "GradientConfig", "GuardConfig", "OpeningsConfig", "SNESConfig", "Search", "Strategy",
+    "GradientConfig", "GuardConfig", "OpeningsConfig", "SHACConfig", "SNESConfig", "Search",
+    "Strategy",
 ]  # fmt: skip
 
 Strategy = Literal["snes", "sep_cma_es", "lm_ma_es", "open_es"]
@@ -83,6 +87,45 @@ class GradientConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         _met(self.scenarios, self.objective)
+
+
+@dataclasses.dataclass(frozen=True)
+class SHACConfig(Checked):
+    """Hyperparameters of the short-horizon actor-critic; see ``jaxpend.shac``."""
+
+    steps: Natural = 5000  # of Adam, those of the critic alone among them; 0: no such stage
+    critic_steps: Natural = 800  # the first so many, in which the critic learns alone
+    num_arms: Count = 128  # that live side by side
+    window: Duration = 0.5  # s, by which each of them moves on in a step
+    dt: Period = 0.004  # s, control and integration period there
+    horizon: Positive = 2.0  # s, in which what is to come loses a factor of e of its weight
+    learning_rate: Positive = 4e-4  # of the policy's weights
+    final_learning_rate: Positive = 0.05  # cosine decay to this fraction of learning_rate
+    clip: Positive = 1.0  # norm of the gradient of one window
+    line_width: Positive = 0.02  # m, over which the line is blurred
+    # rad, and in rad/s ten times as much: largest standard deviation of jumps between windows.
+    kicks: NotNegative = 0.03
+    thrown: Share = 0.2  # of the arms, after a window, as a reset by hand throws them
+    anywhere: Share = 0.02  # of the arms, after a window, put anywhere, a fifth of them hanging
+    trace: Positive = 0.4  # s, in which targets come to trust the critic, not the window
+    critic_hidden: tuple[Count, ...] = (128, 128)
+    critic_learning_rate: Positive = 1e-3
+    critic_updates: Count = 8  # a step, on all windows of it together
+    target_rate: Rate = 0.2  # Polyak averaging of the critic that windows end with
+    searched: str = "all"  # as in SNESConfig
+    objective: Objective = dataclasses.field(default_factory=Objective)
+    chunk: Count = 100  # steps per report
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.steps and self.steps <= self.critic_steps:
+            text = f"steps is {self.steps}; it must be more than the {self.critic_steps} of"
+            raise JaxpendError(f"{text} critic_steps, in which the policy does not learn")
+        if self.dt > self.window:
+            raise JaxpendError(f"dt is {self.dt}; it must not be longer than window")
+        if self.thrown + self.anywhere > 1:
+            text = f"thrown and anywhere are {self.thrown} and {self.anywhere}"
+            raise JaxpendError(f"{text}; they are shares of one whole")
 
 
 @dataclasses.dataclass(frozen=True)

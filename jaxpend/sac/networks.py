@@ -12,7 +12,8 @@ from ..controllers.policy import ACTIVATIONS, Policy
 from ..env import Env
 
 __all__ = [
-    "Actor", "Params", "Twins", "act", "constant_log_std", "distribution", "squashed", "to_policy",
+    "Actor", "Params", "Trunk", "Twins", "act", "constant_log_std", "distribution", "squashed",
+    "to_policy",
 ]  # fmt: skip
 
 LOG_STD_RANGE = (-10.0, 2.0)

@@ -23,6 +23,7 @@ from ..openings import Openings
 from ..runs.folder import RunFolder, refuse_no_group, refuse_other
 from ..runs.statistics import summary
 from ..sac.stage import SAC, Imitation
+from ..shac import SHAC
 from ..snes import SNES
 from ..stage import Stage
 from ..task import Task
@@ -34,7 +35,7 @@ __all__ = ["STAGES", "stages_of", "train"]
 
 # The stages that there are, in their order. A configuration has those for which ``Stage.of`` says
 # so; nothing else in the program knows them by name.
-STAGES: tuple[type[Stage], ...] = (Imitation, SAC, Openings, Gradient, SNES)
+STAGES: tuple[type[Stage], ...] = (Imitation, SAC, Openings, Gradient, SHAC, SNES)
 
 
 def train_stage(stage: Stage, runs: Sequence[SeedRun]) -> None:
