@@ -24,7 +24,7 @@ from jaxpend.files import write_atomically
 HERE = Path(__file__).parent
 TASKS = ("global", "hardware")
 ROBOTS = ("acrobot", "pendubot")
-STAGES = ("sac", "snes")
+STAGES = ("sac", "shac", "snes")
 CLASSICAL = ("mpc_free", "energy_lqr", "tvlqr", "tvlqr_guarded", "lqr")
 THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
@@ -77,13 +77,13 @@ def table(rows: list[dict]) -> str:
         if not its:
             continue
         shares = ["without pushes", "with pushes"] if task == "hardware" else []
-        stages = [stage for stage in STAGES if stage in its[0]]
+        stages = [stage for stage in STAGES if any(stage in row for row in its)]
         head = ["robot", "seed", *(f"after {s.upper()}" for s in stages)]
         head += [f"stand {share}" for share in shares] + ["training"]
         lines += ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
         for row in sorted(its, key=lambda row: (row["robot"], row["seed"])):
             cells = [row["robot"], str(row["seed"])]
-            cells += [f"{row[stage]['score']:.3f}" for stage in stages]
+            cells += [f"{row[stage]['score']:.3f}" if stage in row else "" for stage in stages]
             for share in shares:
                 found = row["fleet"][share]
                 low, high = (100 * end for end in found["interval"])

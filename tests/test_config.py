@@ -174,6 +174,7 @@ SECTIONS = (
     "policy",
     "guard",
     "sac",
+    "shac",
     "openings",
     "gradient",
     "snes",
