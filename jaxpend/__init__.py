@@ -25,7 +25,7 @@ __all__ = [
     "rollout",
     "save_policy",
 ]
-__version__ = "0.12.0"
+__version__ = "0.13.0"
 
 _HOME = {
     "JaxpendError": ".errors",

@@ -14,6 +14,7 @@ learns by TD(lambda) from the same windows. Then the arms are kicked a little, a
 are thrown, or put anywhere.
 """
 
+import math
 from functools import partial
 from typing import Any, Self
 
@@ -39,6 +40,7 @@ from .sac.networks import Params, Trunk
 from .scenario import Scenario
 from .stage import Candidates, Chart, Row, SearchStage, SearchState
 from .task import Task
+from .variations import LONGEST_DELAY
 
 __all__ = ["SHAC", "SHACConfig", "SHACState", "current", "improve", "init"]
 
@@ -86,12 +88,25 @@ def up(config: SHACConfig, task: Task, x: jax.Array) -> jax.Array:
     return jax.nn.sigmoid(above / config.line_width)
 
 
+def window(config: SHACConfig, task: Task, x: jax.Array, key: jax.Array) -> Scenario:
+    """What an arm meets from state ``x`` (4,) on: the nominal plant, or random imperfections."""
+    if not config.randomised:
+        return Scenario(task.plant, x0=x)
+    scenario = task.imperfect(task.plant, key, config.randomised)
+    assert scenario.delay is not None
+    steps = jnp.round(scenario.delay * (task.dt / config.dt)).astype(jnp.int32)
+    return scenario.replace(x0=x, delay=steps)
+
+
 def ahead(
-    config: SHACConfig, policy: Controller, critic: Params, x: jax.Array, task: Task
-) -> tuple[jax.Array, jax.Array]:
-    """What a window from state ``x`` (4,) is worth (), and its states (T + 1, 4)."""
+    config: SHACConfig, policy: Controller, critic: Params, scenario: Scenario, key: jax.Array,
+    task: Task,
+) -> tuple[jax.Array, jax.Array]:  # fmt: skip
+    """What a window is worth (), and its states (T + 1, 4); ``key`` is consumed."""
     options: dict[str, Any] = {"dt": config.dt, "duration": config.window}
-    states = rollout(Scenario(task.plant, x0=x), policy, jax.random.key(0), **options).x
+    if config.randomised:
+        options["delay_slots"] = math.ceil(LONGEST_DELAY * task.dt / config.dt) + 1
+    states = rollout(scenario, policy, key, **options).x
     decay = np.exp(-config.dt / config.horizon)
     worth = (1 - decay) * decay ** np.arange(len(states) - 1) @ up(config, task, states[1:])
     return worth + decay ** (len(states) - 1) * _value(config, critic, states[-1]), states
@@ -230,16 +245,19 @@ def improve(
     task = own_task(start, task)
     adam = _adam(config)
 
-    def each(z: jax.Array, start: Any, critic: Params, x: jax.Array):
+    def each(z: jax.Array, start: Any, critic: Params, x: jax.Array, key: jax.Array):
         policy: Any = coordinates(start, config.searched)[-1](z)
-        return ahead(config, policy.replace(action_noise=None), critic, x, task)
+        key_met, key = jax.random.split(key)
+        met = window(config, task, x, key_met)
+        return ahead(config, policy.replace(action_noise=None), critic, met, key, task)
 
-    windows = jax.vmap(jax.value_and_grad(each, has_aux=True), in_axes=(None, None, None, 0))
+    windows = jax.vmap(jax.value_and_grad(each, has_aux=True), in_axes=(None, None, None, 0, 0))
 
     def step(state: SHACState, _: None) -> tuple[SHACState, dict[str, jax.Array]]:
-        key, key_critic, key_arms = jax.random.split(state.key, 3)
+        key, key_critic, key_arms, key_windows = jax.random.split(state.key, 4)
         z, common = state.parameters, (state.parameters, start, state.target)
-        (worth, x), slopes = devices.split(windows, *common)(state.x)
+        keys = jax.random.split(key_windows, config.num_arms)
+        (worth, x), slopes = devices.split(windows, *common)(state.x, keys)
         norm = jnp.linalg.norm(slopes, axis=1)
         usable = jnp.isfinite(norm) & jnp.isfinite(worth)
         scale = jnp.minimum(1.0, config.clip / jnp.where(norm > 0, norm, 1.0))

@@ -17,7 +17,9 @@ from jaxpend.controllers.guard import guard
 from jaxpend.controllers.search_space import coordinates
 from jaxpend.plant import UPRIGHT, tip_height
 from jaxpend.pytree import in_default
+from jaxpend.rollout import rollout
 from jaxpend.runs.checkpoints import Checkpoints
+from jaxpend.scenario import Scenario
 from jaxpend.shac import SHAC, Value, ahead, improve, init, targets, up
 from jaxpend.train.loop import stages_of
 
@@ -43,15 +45,21 @@ def test_up_is_half_on_the_line_and_whole_above_it():
 
 
 @pytest.mark.x64
-def test_the_gradient_is_that_of_finite_differences():
+@pytest.mark.parametrize("randomised", [0.0, 1.0])
+def test_the_gradient_is_that_of_finite_differences(randomised):
     policy, critic = in_default((POLICY, critic_of(SMALL)))
     z, _, rebuild = coordinates(policy)
     direction = jax.random.normal(KEY, z.shape)
-    x = jnp.array([2.8, 0.3, 1.0, -2.0])
+    config = dataclasses.replace(SMALL, randomised=randomised)
+    scenario = shac.window(config, TASK, jnp.array([2.8, 0.3, 1.0, -2.0]), jax.random.key(3))
+    assert (scenario.delay is not None) == (randomised > 0)
+
+    def worth(z):
+        return run(z, scenario)
 
     @jax.jit
-    def worth(z):
-        return ahead(SMALL, rebuild(z), critic, x, TASK)[0]
+    def run(z, scenario):
+        return ahead(config, rebuild(z), critic, scenario, KEY, TASK)[0]
 
     found = jax.grad(worth)(z) @ direction
     step = 1e-6
@@ -64,7 +72,8 @@ def test_the_gradient_is_that_of_finite_differences():
 def test_the_worth_of_a_window_and_the_targets_are_discounted_sums():
     config = dataclasses.replace(SMALL, horizon=0.1, trace=0.05)
     policy, critic = in_default((POLICY, critic_of(config)))
-    worth, x = ahead(config, policy, critic, jnp.array([2.8, 0.3, 1.0, -2.0]), TASK)
+    scenario = Scenario(TASK.plant, x0=jnp.array([2.8, 0.3, 1.0, -2.0]))
+    worth, x = ahead(config, policy, critic, scenario, KEY, TASK)
     rewards, values = up(config, TASK, x[1:]), Value(config.critic_hidden).apply(critic, x)
     steps = len(x) - 1
     assert steps == 20
@@ -117,6 +126,19 @@ def test_arms_are_thrown_and_put_anywhere_and_never_lost(monkeypatch):
     np.testing.assert_allclose(off.std(axis=0), 0.03 * np.array([1, 1, 10, 10]) / 5**0.5, rtol=0.1)
 
 
+def test_some_windows_are_in_random_scenarios_with_delays_in_steps_of_the_window():
+    config = dataclasses.replace(SMALL, randomised=0.5)
+    x = jnp.array(UPRIGHT)
+    met = jax.vmap(lambda key: shac.window(config, TASK, x, key))(jax.random.split(KEY, 1200))
+    delay = np.asarray(met.delay)[:, 0]
+    assert (delay > 0).mean() == pytest.approx(0.5 / 6, abs=0.03)
+    assert delay.max() == 10  # 40 ms in steps of 4 ms
+    state = init(config, POLICY, KEY, TASK)
+    after, metrics = improve(config, POLICY, state, 4, TASK)
+    assert np.isfinite(metrics["slope"]).all()
+    assert not np.array_equal(after.parameters, state.parameters)
+
+
 def test_it_learns_what_a_policy_has_lost():
     """A policy that has become timid stands up sooner after some steps."""
     *hidden, (kernel, bias) = POLICY.layers
@@ -128,9 +150,11 @@ def test_it_learns_what_a_policy_has_lost():
 
     @jax.jit
     def share(policy):
-        longer = dataclasses.replace(config, window=1.5)
-        states = jax.vmap(lambda x: ahead(longer, policy, state.critic, x, TASK)[1])(x)
-        return up(config, TASK, states).mean()
+        def states(x):
+            scenario = Scenario(TASK.plant, x0=x)
+            return rollout(scenario, policy, KEY, dt=config.dt, duration=1.5).x
+
+        return up(config, TASK, jax.vmap(states)(x)).mean()
 
     for _ in range(2):
         state, metrics = improve(config, timid, state, 100, TASK)

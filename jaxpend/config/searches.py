@@ -107,6 +107,7 @@ class SHACConfig(Checked):
     kicks: NotNegative = 0.03
     thrown: Share = 0.2  # of the arms, after a window, as a reset by hand throws them
     anywhere: Share = 0.02  # of the arms, after a window, put anywhere, a fifth of them hanging
+    randomised: Share = 0.0  # of the windows in a random imperfect scenario
     trace: Positive = 0.4  # s, in which targets come to trust the critic, not the window
     critic_hidden: tuple[Count, ...] = (128, 128)
     critic_learning_rate: Positive = 1e-3
