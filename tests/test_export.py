@@ -6,6 +6,7 @@ import itertools
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ from jaxpend.interop import c as to_c
 from jaxpend.interop import numpy as to_numpy
 from jaxpend.interop import onnx as to_onnx
 from jaxpend.observation import KINDS, Observation
-from jaxpend.pytree import Pytree, pytree
+from jaxpend.pytree import Pytree, pytree, static
 from jaxpend.scenario import Scenario
 
 STARTS = np.array([[0, 0, 0, 0], [2.0, -1.0, 3.0, -4.0]])
@@ -414,6 +415,63 @@ def test_every_printer_prints_every_operation(tmp_path):
         library = compiled(law, tmp_path / precision, precision)
         found = run_in_c(library, precision, times, states)
         np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance)
+
+
+@pytree
+class Remembering(Pytree):
+    """Memory from ``start()``, and a step ``law(memory, t, x)`` to the next one and a torque."""
+
+    start: Callable = static()
+    law: Callable = static()
+
+    def reset(self, key):
+        return self.start()
+
+    def __call__(self, carry, t, x):
+        return self.law(carry, t, x)
+
+
+def check_everywhere(law, folder, tolerance=1e-9, precisions=tuple(OF_C)):
+    """The torques in numpy, ONNX Runtime and C are those of jax, for ten steps."""
+    times = np.arange(10.0)
+    states = np.random.default_rng(4).normal(size=(10, 4)).astype("f4").astype(float)
+    with jax.enable_x64(True):
+        expected = np.asarray(again(law, times, states[None])[0])
+    names: dict = {}
+    exec(to_numpy.source(law), names)
+    found = {"numpy": replayed(names["Controller"](), times, states)}
+    found["onnx"] = run_in_onnx(in_onnx(law), times, states)
+    for precision in precisions:
+        library = compiled(law, folder / precision, precision)
+        found[precision] = run_in_c(library, precision, times, states)
+    for name, torques in found.items():
+        least = {"single": 1e-4, "float32": 1e-6}.get(name, tolerance)
+        np.testing.assert_allclose(torques, expected, rtol=least, atol=least, err_msg=name)
+
+
+WEIGHTS = np.sin(np.arange(80.0)).reshape(20, 4)
+
+
+def shifted(carry, t, x):
+    now, before = carry
+    new = jnp.tanh(WEIGHTS @ x)
+    return (new, now), (new - before)[:2]
+
+
+def swapped(carry, t, x):
+    first, second = carry
+    return (second, first), first[:2] + x[:2]
+
+
+@pytest.mark.parametrize(("law", "size"), [(shifted, 20), (swapped, 40)])
+def test_memory_that_moves_on_is_read_before_it_is_overwritten(tmp_path, law, size):
+    start = lambda: (jnp.zeros(size), jnp.arange(size) / 8)  # noqa: E731
+    check_everywhere(Remembering(start, law), tmp_path)
+
+
+@pytest.mark.parametrize("law", [lambda t, x: x[:2], lambda t, x: jnp.array([1.0, -2.0])])
+def test_a_step_that_computes_nothing_is_exported(tmp_path, law):
+    check_everywhere(Feedback(law), tmp_path)
 
 
 def test_what_is_not_finite_passes_through():

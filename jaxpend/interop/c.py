@@ -236,7 +236,7 @@ class _Printer:
                 if leaf.scalar:
                     then.append(f"{to}[{place}] = {value};")
                 else:
-                    entry = self.entry_of(node, "i")
+                    entry = self.wide(f"{value}[i]") if node in self.exact else f"{value}[i]"
                     then.append(f"{LOOP.format(node.size)}{to}[i] = {entry};")
         return first + then
 

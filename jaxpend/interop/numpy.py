@@ -102,7 +102,7 @@ def _printed(program: Program, class_name: str) -> str:
     step = [f"{_tuple(unpacked)} = self._state"] if unpacked else []
     torque = ", ".join(names[node] for node in program.torque)
     step += ["t = float(t)", "x_0, x_1, x_2, x_3 = (float(entry) for entry in x)"]
-    step += ['with np.errstate(all="ignore"):', *(f"    {line}" for line in body)]
+    step += ['with np.errstate(all="ignore"):', *(f"    {line}" for line in body)] if body else []
     step += [f"self._state = {_tuple(after)}", f"return np.array([{torque}], float)"]
     return FILE.format(
         name=program.name,
