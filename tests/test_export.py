@@ -474,6 +474,24 @@ def test_a_step_that_computes_nothing_is_exported(tmp_path, law):
     check_everywhere(Feedback(law), tmp_path)
 
 
+def few_numbers(t, x):
+    """Loops over numbers one by one, and sums of none."""
+    none = x[:0]
+    after, ends = jax.lax.scan(lambda c, a: (c + a, c * a), 0.0, x)
+    same, no_ends = jax.lax.scan(lambda c, a: (c + 1, c * a), t, none)
+    sums = jnp.sum(none) + jnp.prod(none) + none @ none + jnp.sum(no_ends)
+    wide = jnp.sum(jnp.zeros((6, 0)) @ jnp.zeros((0, 6)) + x[0])
+    return jnp.array([jnp.polyval(jnp.array([0.1, -0.2, 0.3]), x[0]) + after + same, sums + wide
+                      + jnp.sum(ends)])  # fmt: skip
+
+
+def test_loops_over_numbers_and_sums_of_none_are_exported(tmp_path):
+    check_everywhere(Feedback(few_numbers), tmp_path)
+    empty = Remembering(lambda: {"a": jnp.zeros(0)}, lambda carry, t, x: (carry, x[:2]))
+    with refused("Remembering cannot be exported: its memory['a'] has no entries; leave it out"):
+        to_c.source(empty)
+
+
 def test_what_is_not_finite_passes_through():
     exported = in_numpy("shipped")
     exported.reset()

@@ -197,7 +197,7 @@ def _not(tr, args, p, shape):
 
 
 def _logic(tr: Translator, op: str, args: list[Array]) -> Array:
-    if any(arg.kind != "bool" for arg in args):
+    if any(arg.size and arg.kind != "bool" for arg in args):
         raise tr.refuse("it works on the bits of integers")
     return tr.op(op, *args)
 
@@ -353,11 +353,13 @@ def _scan(tr, args, p, shape):
     consts, carry = args[:first], args[first : first + carried]
     outputs: list[list[Array]] = []
     for i in reversed(range(length)) if p["reverse"] else range(length):
-        now = [tr.move(x, lambda a, i=i: a[i]) for x in args[first + carried :]]
+        now = [tr.move(x, lambda a, i=i: a[i, ...]) for x in args[first + carried :]]
         found = _called(tr, p["jaxpr"], [*consts, *carry, *now])
         carry = found[:carried]
         outputs.append(found[carried:])
     if p["reverse"]:
         outputs.reverse()
     stacked = [tr.join(parts, np.stack) for parts in zip(*outputs, strict=True)]
+    if not length:
+        stacked = [tr.constant(np.zeros((0, *a.shape))) for a in p["jaxpr"].out_avals[carried:]]
     return [*carry, *stacked]

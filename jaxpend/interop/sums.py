@@ -10,6 +10,8 @@ __all__ = ["dot_general", "position", "reduced", "running"]
 
 PART = 64  # entries of a vector that is taken apart for an operation that vectors do not have
 OF_ROWS = {"add": "total", "max": "largest", "min": "smallest"}
+# What an operation makes of no number at all.
+NONE = {"add": 0.0, "mul": 1.0, "max": -np.inf, "min": np.inf, "and": True, "or": False}
 Shape = tuple[int, ...]
 
 
@@ -36,6 +38,8 @@ def dot_general(tr: Translator, args: list[Array], dimensions: tuple, shape: Sha
 def _product(tr: Translator, a: Array, b: Array, sizes: tuple[int, int, int]) -> Array:
     """(m, k) times (k, n), flat: (m n,)."""
     m, k, n = sizes
+    if not k:
+        return tr.constant(np.zeros(m * n))
     if not (a.small and b.small and m * n <= SMALL):
         return tr.made(tr.build.matmul(tr.vector(a), tr.vector(b), m, k, n), (m * n,))
     rows, columns = a.content, b.content.T
@@ -51,7 +55,9 @@ def reduced(tr: Translator, a: Array, op: str, axes: Sequence[int], shape: Shape
     """The entries along some axes combined by an operation of two arguments, such as ``add``."""
     kept = [axis for axis in range(len(a.shape)) if axis not in axes]
     k = int(np.prod([a.shape[axis] for axis in axes]))
-    m = a.size // max(k, 1)
+    m = int(np.prod([a.shape[axis] for axis in kept]))
+    if not k:
+        return tr.constant(np.full(shape, NONE[op]))
     rows = tr.move(a, lambda v: v.transpose((*kept, *axes)).reshape(m, k))
     if op in OF_ROWS and not rows.small:
         return tr.made(tr.build.reduce(OF_ROWS[op], tr.vector(rows), m, k), shape)

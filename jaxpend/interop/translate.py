@@ -41,8 +41,10 @@ class Array:
 
     @property
     def kind(self) -> str:
-        """Of its entries."""
-        return self.content.flat[0].kind if self.is_scalars else self.content.kind
+        """Of its entries; of none at all "float"."""
+        if not self.is_scalars:
+            return self.content.kind
+        return self.content.flat[0].kind if self.size else "float"
 
     @property
     def size(self) -> int:
@@ -105,6 +107,8 @@ class Translator:
         if not array.is_scalars:
             return array.content
         scalars = list(array.content.flat)
+        if not scalars:
+            raise self.refuse("it computes with an array that has no entries")
         different = list(dict.fromkeys(scalars))
         if 2 * len(different) > len(scalars):
             return self.build.pack(scalars)
