@@ -44,6 +44,8 @@ __all__ = [
 # N m, with which a robot's passive joint may be driven against its friction.
 PASSIVE = 0.5
 CHUNK = 50  # draws of a board that are judged at a time
+# s; a clock that begins further from 0 than this did not start with the run, and is shifted.
+LATE = 0.1
 
 
 def performance(
@@ -234,7 +236,9 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
         judged_on: a board, as in ``official``; ``boards.hardware`` for runs of a robot.
         regular: refuse what the board's simulation cannot give: other time stamps than those of
             its grid, torques of the passive joint. False: the run of a robot, whose clock is not
-            exact, and whose passive joint may be driven against its friction.
+            exact, and whose passive joint may be driven against its friction. Its clock may begin
+            anywhere: if that is more than 0.1 s from 0, time counts from the first stamp; a first
+            stamp nearer to 0 stays as it is, as the boards take it.
 
     Raises:
         JaxpendError: it is none of this board's runs: longer, or of another robot, or, where it
@@ -251,9 +255,10 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
         raise JaxpendError("the run holds numbers that are not finite")
     if (np.diff(t) < 0).any():
         raise JaxpendError("the time stamps of the run go back")
-    if (last := float(t[-1])) > 1.01 * task.duration:
+    began = float(t[0]) if abs(t[0]) > LATE else 0.0
+    if (lasts := float(t[-1]) - began) > 1.01 * task.duration:
         raise JaxpendError(
-            f"the run lasts {last:.7g} s; a run of this board lasts {task.duration:g}"
+            f"the run lasts {lasts:.7g} s; a run of this board lasts {task.duration:g}"
         )
     steps = np.diff(t)
     worst = int(np.argmax(abs(steps - task.dt)))
@@ -272,7 +277,7 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
             f"is driven at joint {task.joint + 1}; the run is that of another robot"
         )
     with jax.enable_x64(True):
-        return _plain(_criteria(in_default(run), task), task)
+        return _plain(_criteria(in_default(run.replace(t=t - began)), task), task)
 
 
 def _plain(c: Criteria, task: Task) -> dict[str, Any]:

@@ -84,6 +84,32 @@ def test_the_clock_of_a_robot_is_not_exact(swing):
     assert recorded(short, ROBOT)["score"] == 0  # as the boards score what was stopped early
 
 
+def test_the_clock_of_a_robot_may_begin_anywhere(swing):
+    """Time counts from the first stamp, but where that is about 0, as the boards take it."""
+    run, board = swing[0], boards.hardware(ROBOT)
+    expected = recorded(run, board, regular=False)
+
+    def judged(t, start=0):
+        u, x = run.u[start:], run.x[start : len(run.u)]
+        return recorded(Trajectory(t[start : len(run.u)], x, u, None, None), board, regular=False)
+
+    for began in (1.6e9, -100.0, 5.0):
+        found = judged(run.t + began)
+        assert found["score"] == pytest.approx(expected["score"], abs=1e-6)
+        assert found["criteria"]["swingup_time"] == pytest.approx(
+            expected["criteria"]["swingup_time"], abs=1e-6
+        )
+    # The second half alone is half a run, and is scored as what was stopped early.
+    assert judged(run.t, len(run.u) // 2)["score"] == 0
+    near = judged(run.t + 0.05)["criteria"]["swingup_time"]
+    assert near == pytest.approx(expected["criteria"]["swingup_time"] + 0.05)
+    for t, lasts in ((2 * run.t - 10, "19.99"), (np.linspace(-100, 10, len(run.t)), "109.9")):
+        with refused(f"the run lasts {lasts}"):
+            judged(t)
+    with refused("the run starts at 1.6e+09 s"):
+        recorded(run.replace(t=run.t + 1.6e9), ROBOT)
+
+
 ROW = "0,0,0,0,0,0,0\n"
 
 
