@@ -252,7 +252,8 @@ def mildest_failure(
     if not ranges:
         raise JaxpendError("there are no ranges; give at least one imperfection and its ends")
     place_key, draw_key, run_key = jax.random.split(key, 3)
-    fraction = np.asarray(jax.random.uniform(place_key, (samples, len(ranges))), float)
+    # A copy: a view of what jax holds cannot be written to.
+    fraction = np.array(jax.random.uniform(place_key, (samples, len(ranges))), float)
     # Uniform in severity: else almost all samples of many imperfections would be bad in one.
     fraction *= np.linspace(0, 1, samples)[:, None] / fraction.max(axis=1, keepdims=True)
     for name, pair in ranges.items():

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, both_robots, excerpt, refused, task_of
+from conftest import assert_close, both_precisions, both_robots, excerpt, refused, task_of
 from test_policy import random_policy
 
 from jaxpend import Scenario, cli, load_policy, save_policy
@@ -240,7 +240,8 @@ def test_survey_spans_the_product_of_its_values():
     assert found.score is None
 
 
-def test_mildest_failure_is_a_failure_and_harmless_ranges_have_none():
+@both_precisions
+def test_mildest_failure_is_a_failure_and_harmless_ranges_have_none(dtype):
     ranges = {"delay": (0.0, 0.1), "b2": (0.0, 0.001)}
     found = mildest_failure(NEAR_UPRIGHT, BALANCE, ranges, KEY, samples=64, duration=1.5)
     assert 0 < found["failures"] < 1
