@@ -112,7 +112,8 @@ def guarded() -> Iterator[None]:
 def leave(code: int) -> None:
     """End the process, unless all stop together: JAX would wait for the others, then abort."""
     if _lost or (not _stopping and jax.distributed.is_initialized()):
-        sys.stderr.flush()
+        if sys.stderr is not None:
+            sys.stderr.flush()
         os._exit(code)
 
 

@@ -1,5 +1,6 @@
 """What every command shares: exit codes, one-sentence errors, strict JSON, configuration."""
 
+import io
 import json
 import math
 import os
@@ -18,7 +19,7 @@ import pytest
 
 import jaxpend
 from jaxpend import JaxpendError, __version__, cli, designs
-from jaxpend.cli import cache, commands
+from jaxpend.cli import cache, commands, output
 from jaxpend.config import TrainRun
 from jaxpend.config_files import recipes
 from jaxpend.fields import Count
@@ -408,9 +409,20 @@ def test_output_that_is_closed_or_full(runs):
     assert (done.returncode, done.stderr) == (2, words)
     assert command(f"jaxpend runs {runs} >&- 2>&-").returncode == 0
     assert command(f"jaxpend runs {runs}/none >&- 2>&-").returncode == 2
+    done = command("jaxpend score --robot pendubot --json /dev/full")
+    words = "jaxpend score: cannot use /dev/full: No space left on device"
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (2, words)
     done = command(f"jaxpend runs {runs} --json - >/dev/full")
     words = "jaxpend runs: cannot use: No space left on device\n"
     assert (done.returncode, done.stderr) == (2, words)
+
+
+def test_a_table_is_printed_where_not_all_of_its_letters_are_known(monkeypatch):
+    written = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr("sys.stdout", written)
+    output.emit("N\u00b2m\u00b2s 1\n", "-")
+    written.flush()
+    assert written.buffer.getvalue() == b"N?m?s 1\n"
 
 
 @pytest.mark.parametrize("columns", ["0", "1", "-5", "wide"])

@@ -64,6 +64,7 @@ def template(tmp_path_factory):
         (folder / f"{name}.yaml").write_text(content)
     (folder / "bytes").write_bytes(bytes(range(256)))
     (folder / "empty").touch()
+    (folder / "package.json").write_text('{"name": "mine"}')
     (folder / "own.py").write_text(CONTROLLERS)
     (folder / "leaves_module.py").write_text("raise SystemExit(0)")
     (folder / "broken_module.py").write_text("def f(:")
@@ -200,6 +201,15 @@ CASES = [
     ("import own.py --robot pendubot --preset evolsac --out pendubot",
      "cannot write pendubot: it is there and is no policy file"),
     ("identify own.py --out new --json new", "--json and --out are both new; name two files"),
+    ("runs runs --json package.json", "cannot write package.json: it is there and is something"),
+    ("score --controller pd --json runs/old/config.json",
+     "cannot write runs/old/config.json: it is there and is something else"),
+    ("hardware --controller pd --json package.json", "cannot write package.json: it is there and"),
+    ("leaderboard --json - --out -", "--json and --out are both standard output; name a file"),
+    ("robustness --controller pd --out new --json new/pendubot.csv",
+     "--json and --out are both new/pendubot.csv; name two files"),
+    ("hardware --controller pd --out new --json new/identified_pendubot.png",
+     "--json and --out are both new/identified_pendubot.png; name two files"),
     # Configurations.
     ("sac --config .", "cannot read .: Is a directory"),
     ("sac --config bytes", "bytes is not valid YAML"),

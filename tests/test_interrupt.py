@@ -111,3 +111,11 @@ except Stopped:
     assert p.returncode == 130
     assert b"once more stops at once" in said
     assert -1 < said.rindex(b"\x1b[?25l") < said.rindex(b"\x1b[?25h")
+
+
+def test_a_signal_is_answered_where_standard_error_is_closed(monkeypatch):
+    monkeypatch.setattr("sys.stderr", None)
+    with deferred():
+        os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(Stopped):
+            stop_if_asked()

@@ -4,11 +4,13 @@ import dataclasses
 import json
 import math
 import os
+import shutil
 from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
 from conftest import limited_file_size, refused
+from training_runs import rows_of
 
 from jaxpend import JaxpendError, Policy, cli, load_policy
 from jaxpend.config import SACRun, TrainRun
@@ -162,6 +164,20 @@ def test_only_one_process_works_on_a_run(tmp_path):
         again.write_json("result.json", {"score": 1.0})
         # A finished run can be looked at meanwhile.
         assert RunFolder(tmp_path, Outer(), "command").result == {"score": 1.0}
+
+
+def test_a_run_whose_folder_was_replaced_stops_and_leaves_the_new_one_alone(tmp_path):
+    first = RunFolder(tmp_path / "run", Outer(), "command")
+    first.log("sac", score=0.1)
+    shutil.rmtree(first.path)
+    with refused("was removed or replaced while a run was in it", start=str(first.path)):
+        first.log("sac", score=0.2)
+    with RunFolder(first.path, Outer(), "command") as second:
+        second.log("sac", score=0.3)
+        with refused("was removed or replaced"):
+            first.log("sac", score=0.4)
+        assert [row["score"] for row in rows_of(second.path, "sac")] == [0.3]
+    first.close()
 
 
 @pytest.mark.parametrize("name", ["config.json", "run.json", "result.json"])

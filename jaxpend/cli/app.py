@@ -5,6 +5,7 @@ import dataclasses
 import importlib
 import keyword
 import logging
+import os
 import re
 import signal
 import sys
@@ -101,6 +102,14 @@ COMMANDS = {
 INTERRUPTED = re.compile(r"^(?:\w+: )*KeyboardInterrupt\b", re.MULTILINE)
 
 
+def _is_somewhere() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return False
+    return True
+
+
 @contextlib.contextmanager
 def one_sentence(prog: str) -> Iterator[None]:
     """Turn what goes wrong in a command into one sentence on standard error and an exit code.
@@ -121,6 +130,8 @@ def one_sentence(prog: str) -> Iterator[None]:
     except OSError as error:
         where = f" {error.filename}" if error.filename else ""
         code, text = 2, f"cannot use{where}: {error.strerror or error}"
+        if not where and not _is_somewhere():
+            text = "the current folder is gone; change to one that is there"
     except (MemoryError, RuntimeError) as error:
         code, text = 2, in_words(error)
         if INTERRUPTED.search(str(error)):

@@ -6,7 +6,7 @@ from typing import Literal
 from ..fields import Count, Natural, Positive, Robot, Seed
 from ..robots import ROBOTS
 from .judging import Subject
-from .output import JSON, check_file, check_results, emit_json
+from .output import check_json, check_results, emit_json
 
 __all__ = ["robustness"]
 
@@ -55,7 +55,8 @@ def robustness(
     marked = {name: (f"{name}.json", b'"over_keys"') for name in ROBOTS}
     check_results(out, [f"{robot}.json", f"{robot}.csv", f"{robot}_map.png"], marked[robot])
     check_results(out, ["robustness.png"], *marked.values())
-    check_file(json, JSON)
+    pictures = (f"{robot}.csv", f"{robot}_map.png", "robustness.png")
+    check_json(json, "over_keys", out, pictures)
     subject = Subject(robot, policy, controller, plant, design, torque_limit)
     import jax
 

@@ -18,7 +18,7 @@ from .fleets import hardware as hardware
 from .identifying import identify as identify
 from .importing import import_ as import_
 from .judging import Subject, board_of, of_draws
-from .output import JSON, MARKDOWN, check_apart, check_file, check_results, emit, emit_json
+from .output import MARKDOWN, check_apart, check_file, check_json, check_results, emit, emit_json
 
 
 def train(config: TrainRun, command: str) -> None:
@@ -76,7 +76,7 @@ def runs(folder: Path = Path("runs"), /, json: str | None = None) -> None:
         folder: folder of run folders.
         json: write the list as JSON to this file, or "-" for standard output.
     """
-    check_file(json, JSON)
+    check_json(json, "state")
     from ..runs.reader import listing
     from .tables import runs_table
 
@@ -153,7 +153,7 @@ def score(
         save: write the run that is judged to this CSV file, which --csv and RealAIGym read.
         json: write the result as JSON to this file, or "-" for standard output.
     """
-    check_file(json, JSON)
+    check_json(json, "criteria")
     check_file(save)
     check_apart(json=json, save=save)
     from .. import boards
@@ -262,7 +262,7 @@ def leaderboard(
         json: write the result as JSON to this file, or "-" for standard output.
         out: write the table as Markdown to this file, or "-" for standard output.
     """
-    check_file(json, JSON)
+    check_json(json, "columns")
     check_file(out, MARKDOWN)
     check_apart(json=json, out=out)
     from .. import leaderboard as boards
@@ -301,7 +301,7 @@ def optimise(
         search: how widely to look.
     """
     check_file(out)
-    check_file(json, JSON)
+    check_json(json, "optima")
     check_apart(json=json, out=out)
     import jax
 
@@ -314,7 +314,8 @@ def optimise(
     start = time.perf_counter()
 
     def say(line: str) -> None:
-        print(f"[{time.perf_counter() - start:5.0f} s] {line}", file=sys.stderr, flush=True)
+        if sys.stderr is not None:  # else Python would print it among the results
+            print(f"[{time.perf_counter() - start:5.0f} s] {line}", file=sys.stderr, flush=True)
 
     with jax.enable_x64(True):
         found = find(v2(robot).task, search, say=say)

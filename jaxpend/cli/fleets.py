@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ..fields import Count, Natural, Preset, Robot, Seed
 from .judging import Subject
-from .output import JSON, check_file, check_results, emit_json
+from .output import check_json, check_results, emit_json
 
 __all__ = ["hardware"]
 
@@ -41,7 +41,7 @@ def hardware(
     """
     name = f"{preset}_{robot}"
     check_results(out, [f"{name}.json", f"{name}.png"], (f"{name}.json", b'"by"'))
-    check_file(json, JSON)
+    check_json(json, "conditions", out, [f"{name}.png"])
     subject = Subject(robot, policy, controller, plant, design, on="hardware")
     import jax
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ..errors import JaxpendError
 from ..fields import Positive
-from .output import JSON, check_apart, check_file, emit_json
+from .output import check_apart, check_file, check_json, emit_json
 
 __all__ = ["identify"]
 
@@ -39,7 +39,7 @@ def identify(
     if plant and design:
         raise JaxpendError("--plant and --design are both given; the search starts from one")
     check_file(out, (BEGINS,))
-    check_file(json, JSON)
+    check_json(json, "parameters")
     check_apart(json=json, out=out)
     from .. import designs
     from ..files import write_atomically

@@ -1,5 +1,6 @@
 """What commands write: JSON, and where it may go."""
 
+import json
 import os
 import sys
 from collections.abc import Iterable
@@ -10,21 +11,28 @@ from ..errors import JaxpendError
 from ..files import to_json, write_atomically
 
 __all__ = [
-    "JSON", "MARKDOWN", "check_apart", "check_file", "check_folder", "check_results",
+    "MARKDOWN", "check_apart", "check_file", "check_folder", "check_json", "check_results",
     "drop_unwritable", "emit", "emit_json",
 ]  # fmt: skip
 
-# How files begin that commands write, of all that is written with one purpose.
-JSON, MARKDOWN = (b"{", b"["), (b"| controller ",)
+MARKDOWN = (b"| controller ",)  # how tables begin that commands write
 
 
 def emit(text: str, target: str | Path | None) -> None:
     """Write text to standard output ("-") or, atomically, to a file; None: nowhere."""
     if str(target) == "-":
         check_file("-")
-        sys.stdout.write(text)
+        _print(text)
     elif target is not None:
         write_atomically(target, text)
+
+
+def _print(text: str) -> None:
+    try:
+        sys.stdout.write(text)
+    except UnicodeEncodeError:  # a terminal that knows no superscripts
+        coding = sys.stdout.encoding
+        sys.stdout.write(text.encode(coding, "replace").decode(coding))
 
 
 def emit_json(value: Any, target: str | Path | None) -> None:
@@ -52,8 +60,34 @@ def check_file(path: str | Path | None, begins: tuple[bytes, ...] = ()) -> None:
         with Path(path).open("rb") as file:
             start = file.read(max(map(len, begins)))
         if start and not start.startswith(begins):
-            text = f"cannot write {path}: it is there and is something else; choose another name"
-            raise JaxpendError(text)
+            raise _other(path)
+
+
+def _other(path: str | Path) -> JaxpendError:
+    text = f"cannot write {path}: it is there and is something else; choose another name"
+    return JaxpendError(text)
+
+
+def check_json(
+    path: str | Path | None, key: str, out: Path | None = None, names: Iterable[str] = ()
+) -> None:
+    """``check_file``, and refuse a file that is not such JSON: objects with a ``key``, or one.
+
+    ``names`` are files in the folder ``out`` that are written too, so that it must be none of them.
+    """
+    check_file(path)
+    if out is not None:
+        for name in names:
+            check_apart(json=path, out=out / name)
+    if path is None or str(path) == "-" or not Path(path).is_file():
+        return
+    try:
+        there = json.loads(Path(path).read_bytes() or "[]")
+    except (ValueError, RecursionError):
+        raise _other(path) from None
+    each = there if isinstance(there, list) else [there]
+    if not all(isinstance(one, dict) and key in one for one in each):
+        raise _other(path)
 
 
 def check_folder(path: str | Path | None) -> None:
@@ -95,10 +129,12 @@ def check_results(folder: Path | None, names: Iterable[str], *marked: tuple[str,
 
 
 def check_apart(**files: Any) -> None:
-    """Refuse two options that name one file, other than "-"."""
+    """Refuse two options that name one file, or both of them standard output."""
     first, second = files
     one, other = (path and str(path) for path in files.values())
-    if one and other and one != "-" and os.path.realpath(one) == os.path.realpath(other):
+    if one == other == "-":
+        raise JaxpendError(f"--{first} and --{second} are both standard output; name a file")
+    if one and other and os.path.realpath(one) == os.path.realpath(other):
         raise JaxpendError(f"--{first} and --{second} are both {one}; name two files")
 
 

@@ -132,7 +132,7 @@ class RunFolder(contextlib.AbstractContextManager):
     def _lock(self) -> None:
         # The system releases it when the process ends, however it ends.
         descriptor = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
-        self._close = weakref.finalize(self, os.close, descriptor)
+        self._close, self._descriptor = weakref.finalize(self, os.close, descriptor), descriptor
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -142,6 +142,16 @@ class RunFolder(contextlib.AbstractContextManager):
             raise JaxpendError(f"{text}; wait for it or choose another name") from None
         os.ftruncate(descriptor, 0)
         os.write(descriptor, str(os.getpid()).encode())
+
+    def check_there(self) -> None:
+        """Raise ``JaxpendError`` if the folder is no longer the one that is locked."""
+        try:
+            there = os.path.samestat(os.fstat(self._descriptor), os.stat(self.path / ".lock"))
+        except FileNotFoundError:
+            there = False
+        if not there:
+            text = f"{self.path} was removed or replaced while a run was in it"
+            raise JaxpendError(f"{text}; the run has stopped, begin it again")
 
     def close(self) -> None:
         """Let other processes have the folder."""
@@ -180,6 +190,7 @@ class RunFolder(contextlib.AbstractContextManager):
         """Append one row of metrics, the whole of it or nothing."""
         row = {"stage": stage, "seconds": self.seconds}
         row |= {k: v if isinstance(v, int | str) else float(v) for k, v in values.items()}
+        self.check_there()
         before = self.metrics_bytes
         try:
             with (self.path / "metrics.jsonl").open("a") as file:

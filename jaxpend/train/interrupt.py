@@ -7,7 +7,6 @@ for one, where Python prints and drops it: the run would go on as if nothing had
 import contextlib
 import os
 import signal
-import sys
 from collections.abc import Callable, Iterator
 
 __all__ = ["Stopped", "deferred", "stop_if_asked"]
@@ -26,7 +25,7 @@ class Stopped(KeyboardInterrupt):
 def _ask(signum, _frame) -> None:
     _asked.append(signum)
     signal.signal(signum, signal.SIG_DFL)  # once more: the end, even inside a compiled call
-    show_cursor = "\r\x1b[?25h" if sys.stderr.isatty() else ""
+    show_cursor = "\r\x1b[?25h" if os.isatty(2) else ""
     text = f"{show_cursor}stopping at the end of this step of the loop; once more stops at once\n"
     with contextlib.suppress(OSError):  # not print: the handler may have interrupted one
         os.write(2, text.encode())
