@@ -21,7 +21,7 @@ from .errors import JaxpendError
 from .hardware import draw
 from .plant import Plant, tip_height
 from .rollout import rollout
-from .scenario import DT, Scenario
+from .scenario import Scenario
 from .sweep import at_least_one
 from .task import Task
 
@@ -88,8 +88,11 @@ def wilson(successes: int, trials: int) -> list[float]:
     return list(binomtest(successes, trials).proportion_ci(0.95, "wilson"))
 
 
-def off(scenario: Scenario, nominal: Plant) -> dict[str, jax.Array]:
-    """How a robot differs from the nominal one: factors of parameters (), and the rest in SI."""
+def off(scenario: Scenario, nominal: Plant, dt: float) -> dict[str, jax.Array]:
+    """How a robot differs from the nominal one: factors of parameters (), and the rest in SI.
+
+    Its delays are in steps of ``dt`` s.
+    """
     plant, found = scenario.plant, {}
     for field, name in PARAMETERS.items():
         for joint in (0, 1):
@@ -102,7 +105,7 @@ def off(scenario: Scenario, nominal: Plant) -> dict[str, jax.Array]:
     assert scenario.responsiveness is not None
     assert scenario.pulses is not None
     assert scenario.delay_jitter is not None
-    found |= {"delay": DT * scenario.delay[0], "jitter": DT * scenario.delay_jitter}
+    found |= {"delay": dt * scenario.delay[0], "jitter": dt * scenario.delay_jitter}
     found["responsiveness"] = scenario.responsiveness
     return found | {"push": jnp.abs(scenario.pulses.amplitude).max(initial=0.0)}
 
@@ -115,15 +118,16 @@ def _tried(controller: Controller, keys: jax.Array, task: Task) -> tuple[Any, ..
 
     def one(controller: Controller, key: jax.Array, pushed: jax.Array) -> tuple[Any, ...]:
         key_robot, key_run = jax.random.split(key)
-        scenario = draw(spread, task.plant, key_robot, pushed=pushed, duration=task.duration)
-        run = rollout(scenario, controller, key_run, dt=task.dt, duration=task.duration)
+        grid: dict[str, Any] = {"dt": task.dt, "duration": task.duration}
+        scenario = draw(spread, task.plant, key_robot, pushed=pushed, **grid)
+        run = rollout(scenario, controller, key_run, delay_slots=task.delay_slots, **grid)
         c: Criteria = task.criteria(run, scenario.plant)
         length = scenario.plant.length
         up = tip_height(length, run.x) > line * jnp.sum(length)
         down = task.dt * jnp.sum(~up & (jnp.cumsum(up) > 0))
         down = jnp.where(up.any(), down, task.duration)
         good = task.stands(run.x, length) & ~c.diverged
-        return (good, task.score(c), down, c.diverged), off(scenario, task.plant)
+        return (good, task.score(c), down, c.diverged), off(scenario, task.plant, task.dt)
 
     def both(controller: Controller, key: jax.Array) -> tuple[Any, ...]:
         found, quantities = jax.vmap(partial(one, controller, key))(jnp.array([False, True]))

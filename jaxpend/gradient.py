@@ -105,7 +105,7 @@ def robustness(
 ) -> jax.Array:
     """Mean uprightness of a run of ``config.scenario_duration`` s; ``key`` is consumed."""
     options = {"duration": config.scenario_duration, "integrator": _fading(config.memory)}
-    run = rollout(scenario, controller, key, dt=task.dt, **options)
+    run = rollout(scenario, controller, key, dt=task.dt, delay_slots=task.delay_slots, **options)
     return uprightness(run.x).mean()
 
 

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 
 from .errors import JaxpendError
 from .plant import Plant
-from .scenario import DT, Compensation, Encoder, Scenario, random_pulses
+from .scenario import DT, DURATION, Compensation, Encoder, Scenario, random_pulses
 
-__all__ = ["PRESETS", "Spread", "draw"]
+__all__ = ["LONGEST", "PRESETS", "Spread", "draw"]
 
 
 LONGEST = 0.06  # s, of a delay: what a rollout's buffer of past states holds by default
@@ -76,10 +76,20 @@ PRESETS = {
 }  # fmt: skip
 
 
-def draw(spread: Spread, plant: Plant, key: jax.Array, *, pushed: Any, duration: float) -> Scenario:
+def draw(
+    spread: Spread,
+    plant: Plant,
+    key: jax.Array,
+    *,
+    pushed: Any,
+    duration: float,
+    dt: float = DT,
+) -> Scenario:
     """A robot with its sensors and motor; ``key`` is consumed, ``pushed`` is a bool (), traced.
 
-    Pushes end 2 s before the end of a run of ``duration`` s, so that it can stand after them.
+    Pushes end 2 s before the end of a run of ``duration`` s, so that it can stand after them; in
+    a run shorter than 10 s they lie closer together, and that time is shorter by as much. Delays
+    are in steps of ``dt`` s.
     """
     keys = dict(zip(("plant", "rest", "pulses"), jax.random.split(key, 3), strict=True))
     parts = jax.random.uniform(keys["plant"], (6, 2), minval=-1.0, maxval=1.0)
@@ -103,8 +113,13 @@ def draw(spread: Spread, plant: Plant, key: jax.Array, *, pushed: Any, duration:
         actuation=jnp.ones(2),  # pushes move the passive joint too; its torque limit stays 0
     )
     angle, speed = spread.angle_noise * rest[1], spread.velocity_noise * rest[2]
+    share = min(1.0, duration / DURATION)
     pulses = random_pulses(
-        keys["pulses"], duration=duration - 2.0, per_joint=spread.pushes, amplitude=spread.push
+        keys["pulses"],
+        duration=duration - 2.0 * share,
+        per_joint=spread.pushes,
+        distance=share,
+        amplitude=spread.push,
     )
     encoder = compensation = None
     if spread.compensation:
@@ -115,8 +130,8 @@ def draw(spread: Spread, plant: Plant, key: jax.Array, *, pushed: Any, duration:
     return Scenario(
         robot,
         measurement_noise=jnp.stack([angle, angle, speed, speed]),
-        delay=jnp.full(4, jnp.round(spread.delay / DT * rest[3]).astype(jnp.int32)),
-        delay_jitter=jnp.round(spread.jitter / DT * rest[6]).astype(jnp.int32),
+        delay=jnp.full(4, jnp.round(spread.delay / dt * rest[3]).astype(jnp.int32)),
+        delay_jitter=jnp.round(spread.jitter / dt * rest[6]).astype(jnp.int32),
         torque_noise=spread.torque_noise * rest[4] * (plant.torque_limit > 0),
         responsiveness=spread.response + (1 - spread.response) * rest[5],
         pulses=pulses.replace(amplitude=jnp.where(pushed, pulses.amplitude, 0.0)),

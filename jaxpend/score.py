@@ -55,8 +55,14 @@ def performance(
 
     ``key`` is that of ``rollout``, ``options`` are its other ones.
     """
-    run = rollout(scenario, controller, key, dt=task.dt, duration=task.duration, **options)
+    options = _of_task(task) | options
+    run = rollout(scenario, controller, key, **options)
     return task.criteria(run, scenario.plant if isinstance(scenario, Scenario) else scenario)
+
+
+def _of_task(task: Task) -> dict[str, Any]:
+    """Options of ``rollout``: the time grid of a task, and room for the delays that it draws."""
+    return {"dt": task.dt, "duration": task.duration, "delay_slots": task.delay_slots}
 
 
 def imperfect(
@@ -72,8 +78,7 @@ def imperfect(
     def one(
         controller: Controller, scenario: Scenario, key: jax.Array
     ) -> tuple[Criteria, jax.Array]:
-        options: dict[str, Any] = {"dt": task.dt, "duration": task.duration}
-        run = rollout(scenario, controller, key, **options)
+        run = rollout(scenario, controller, key, **_of_task(task))
         return task.criteria(run, scenario.plant), task.stands(run.x, scenario.plant.length)
 
     every = jax.vmap(one, in_axes=(None, 0, 0))
@@ -117,7 +122,7 @@ def trial_run(
     of the noise.
     """
     key, scenario = jax.random.key(seed), scenario or Scenario(task.plant)
-    run = rollout(scenario, controller, key, dt=task.dt, duration=task.duration)
+    run = rollout(scenario, controller, key, **_of_task(task))
     passive = jnp.abs(run.u_command[:, 1 - task.joint])
     if scenario.resets is not None:
         passive = jnp.where(

@@ -14,12 +14,12 @@ import numpy as np
 from . import designs
 from .criteria import HEIGHT, Criteria, ScoreV2, criteria, upright
 from .errors import JaxpendError
-from .hardware import Spread, draw
+from .hardware import LONGEST, Spread, draw
 from .plant import Plant, tip_height
 from .resets import HOLD, JITTER, Resets, random_resets
 from .robots import active_joint
-from .rollout import Trajectory
-from .scenario import DT, Scenario
+from .rollout import SLOTS, Trajectory
+from .scenario import DT, DURATION, Scenario
 from .variations import sample
 
 __all__ = ["Task"]
@@ -85,6 +85,12 @@ class Task:
         return round(self.duration / self.dt)
 
     @property
+    def delay_slots(self) -> int:
+        """Past states that a rollout must keep for the delays of its random scenarios."""
+        # Delay and jitter, which are rounded apart, together reach one step beyond the longest.
+        return max(SLOTS, round(LONGEST / self.dt) + 2)
+
+    @property
     def shipped(self) -> str:
         """Name of the policy that ships for it."""
         kind = "hardware_" if self.spread else "global_" if self.resets else ""
@@ -113,22 +119,35 @@ class Task:
         """A robot of a task with a ``spread``, around its plant; ``key`` is consumed."""
         assert self.spread is not None
         plant = self.plant if plant is None else plant
-        return draw(self.spread, plant, key, pushed=pushed, duration=self.duration)
+        return draw(self.spread, plant, key, pushed=pushed, dt=self.dt, duration=self.duration)
 
     def sample(self, key: jax.Array, share: float = 1.0) -> Scenario:
         """A trial with random imperfections, in a ``share`` of cases; ``key`` is consumed."""
-        return self._thrown(self.imperfect(self.plant, key, share), key)
+        options = {"dt": self.dt, "duration": self.duration}
+        return self._thrown(self.imperfect(self.plant, key, share, **options), key)
 
-    def imperfect(self, plant: Plant, key: jax.Array, share: float = 1.0) -> Scenario:
+    def imperfect(
+        self,
+        plant: Plant,
+        key: jax.Array,
+        share: float = 1.0,
+        *,
+        dt: float = DT,
+        duration: float = DURATION,
+    ) -> Scenario:
         """Random imperfections around a nominal plant; ``key`` is consumed.
 
         Of a task with a ``spread`` it is a robot of that, and a ``share`` of them is pushed; else
         it has one imperfection of the robustness benchmark's six kinds (``variations.sample``).
+        What steps it need not be a run of the task, such as an episode of the learning
+        environment: ``dt``, of which delays are whole steps, and ``duration``, s, are its own.
         """
+        options = {"dt": dt, "duration": duration}
         if self.spread is None:
-            return sample(plant, key, share)
+            return sample(plant, key, share, **options)
         key_robot, key_pushed = jax.random.split(key)
-        return self.robot_of(key_robot, plant, jax.random.bernoulli(key_pushed, share))
+        pushed = jax.random.bernoulli(key_pushed, share)
+        return draw(self.spread, plant, key_robot, pushed=pushed, **options)
 
     def stands(self, x: jax.Array, length: jax.Array | None = None) -> jax.Array:
         """Whether runs, states (..., N, 4), end well: (...) bool.

@@ -20,7 +20,7 @@ import numpy as np
 from .errors import JaxpendError, choose
 from .fields import Positive, checked
 from .plant import Plant
-from .scenario import DT, Scenario, delay_steps, random_pulses
+from .scenario import DT, DURATION, Scenario, delay_steps, random_pulses
 
 __all__ = [
     "INERTIAL", "LONGEST_DELAY", "RANGES", "VARIATIONS", "Variation", "numbers", "sample", "vary",
@@ -118,7 +118,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "responsiveness": (0.1, 2.0),
     "delay": (0.0, 0.04),
 }
-LONGEST_DELAY = round(RANGES["delay"][1] / DT)  # steps
+LONGEST_DELAY = round(RANGES["delay"][1] / DT)  # steps of ``DT``
 
 
 VARIATIONS: dict[str, Variation] = {
@@ -219,12 +219,21 @@ def _vary_plant(plant: Plant, which: jax.Array, amount: jax.Array) -> Plant:
     )
 
 
-def sample(plant: Plant, key: jax.Array, share: float = 1.0) -> Scenario:
+def sample(
+    plant: Plant,
+    key: jax.Array,
+    share: float = 1.0,
+    *,
+    dt: float = DT,
+    duration: float = DURATION,
+) -> Scenario:
     """A scenario with one random imperfection; ``key`` is consumed.
 
     A sixth each: a model parameter, velocity noise, torque noise, torque response, delay,
     disturbance pulses. ``plant`` is the nominal one; all but a ``share`` of the scenarios are
-    nominal too.
+    nominal too. It is stepped every ``dt`` s, so that a delay is whole steps of that, none longer
+    than in the benchmark, for ``duration`` s: in a run shorter than the benchmark's pulses lie
+    closer together, by as much.
     """
     key_kind, key_which, key_amount, key_pulses, key_share = jax.random.split(key, 5)
     kind = jax.random.randint(key_kind, (), 0, 6)
@@ -233,8 +242,9 @@ def sample(plant: Plant, key: jax.Array, share: float = 1.0) -> Scenario:
     amount = jax.random.uniform(key_amount, minval=-1.0, maxval=1.0)
     part = (amount + 1) / 2  # the same draw on [0, 1]
     slow, fast = RANGES["responsiveness"]
-    pulses = random_pulses(key_pulses)
-    delay = jnp.where(kind == 4, jnp.round(part * LONGEST_DELAY), 0).astype(jnp.int32)
+    pulses = random_pulses(key_pulses, duration=duration, distance=min(1.0, duration / DURATION))
+    longest = int(delay_steps(RANGES["delay"][1], dt)[0])
+    delay = jnp.where(kind == 4, jnp.round(part * longest), 0).astype(jnp.int32)
     noise = jnp.where(kind == 1, RANGES["velocity_noise"][1] * part, 0.0)
     torque_noise = jnp.where(kind == 2, RANGES["torque_noise"][1] * part, 0.0)
     return Scenario(

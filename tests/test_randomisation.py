@@ -1,11 +1,15 @@
 """Random scenarios: one imperfection each, within the ranges of the benchmark's grids."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
+from jaxpend.boards import HARDWARE, v2
 from jaxpend.designs import competition
 from jaxpend.robustness import strips
+from jaxpend.rollout import SLOTS
 from jaxpend.variations import LONGEST_DELAY, sample
 
 PLANT = competition("acrobot")
@@ -63,6 +67,30 @@ def test_ranges_are_those_of_the_benchmarks_grids(scenarios):
     assert scenarios.delay.max() == LONGEST_DELAY
     assert not scenarios.torque_noise[:, 0].any()
     assert not scenarios.measurement_noise[:, :2].any()
+
+
+def drawn_by(draw, count=200):
+    keys = jax.random.split(jax.random.key(0), count)
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(draw))(keys))
+
+
+@pytest.mark.parametrize("task", [v2("acrobot").task, HARDWARE["acrobot"].task])
+def test_delays_and_pulses_are_of_the_runs_time_grid(task):
+    """Of the task's where its runs are meant, of that of what steps it where an episode is."""
+    longest, lasts = (0.04, 3.0) if task.spread is None else (0.014, 3.0 - 0.6)
+    slow = dataclasses.replace(task, dt=0.01, duration=3.0)
+    found = drawn_by(slow.sample)
+    assert 0 < 0.01 * found.delay.max() <= longest + 1e-6
+    assert found.pulses.time.min() > 0
+    assert 0.75 * lasts < found.pulses.time.max() <= lasts
+    usual = drawn_by(task.sample)
+    episodes = drawn_by(lambda key: slow.imperfect(slow.plant, key))
+    jax.tree.map(np.testing.assert_array_equal, episodes, usual)
+    fine = dataclasses.replace(task, dt=0.0005)
+    lags = drawn_by(fine.sample)
+    assert usual.delay.max() < lags.delay.max()
+    assert lags.longest_delay < fine.delay_slots
+    assert task.delay_slots == SLOTS
 
 
 def test_all_but_a_share_are_nominal():
