@@ -47,7 +47,7 @@ def _legend(axes) -> None:
     """Beside the title, where no data are."""
     axes.legend(
         loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0.1, borderpad=0.2,
-        handlelength=1.1, handletextpad=0.5, columnspacing=1.2,
+        handlelength=0.9, handletextpad=0.4, columnspacing=1.0, fontsize=9,
     )  # fmt: skip
 
 
