@@ -251,7 +251,11 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
             numbers that are not finite, or time stamps that go back.
     """
     task = board(judged_on).task
-    t, x, u = (np.asarray(values, float) for values in (run.t, run.x, run.u))
+    try:
+        t, x, u = (np.asarray(values, float) for values in (run.t, run.x, run.u))
+    except (AttributeError, TypeError, ValueError):
+        text = "a Trajectory whose t (N,), x (N, 4) and u (N, 2) are arrays of numbers"
+        raise JaxpendError(f"the run cannot be read; it must be {text}") from None
     count = len(t) if t.ndim == 1 else 0
     if count < 3 or u.shape not in ((count, 2), (count - 1, 2)) or x.shape != (count, 4):
         shapes = f"t {t.shape}, x {x.shape}, u {u.shape}"
@@ -282,7 +286,8 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
             f"is driven at joint {task.joint + 1}; the run is that of another robot"
         )
     with jax.enable_x64(True):
-        return _plain(_criteria(in_default(run.replace(t=t - began)), task), task)
+        # As arrays: of lists, jax would take every number for an argument of its own.
+        return _plain(_criteria(in_default(Trajectory(t - began, x, u, x, u)), task), task)
 
 
 def _plain(c: Criteria, task: Task) -> dict[str, Any]:

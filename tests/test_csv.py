@@ -110,6 +110,17 @@ def test_the_clock_of_a_robot_may_begin_anywhere(swing):
         recorded(run.replace(t=run.t + 1.6e9), ROBOT)
 
 
+def test_a_run_of_lists_is_judged_as_one_of_arrays(swing):
+    run = swing[0]
+    lists = Trajectory(*(getattr(run, name).tolist() for name in vars(run)))
+    assert recorded(lists, ROBOT) == recorded(run, ROBOT)
+    for wrong in (run.replace(t=["a"]), run.replace(x=[[1.0], [1.0, 2.0]]), None):
+        with refused("the run cannot be read; it must be a Trajectory"):
+            recorded(wrong, ROBOT)
+    with refused("the run has t (), "):
+        recorded(run.replace(t=None), ROBOT)
+
+
 ROW = "0,0,0,0,0,0,0\n"
 
 
