@@ -182,5 +182,6 @@ def upright(x: jax.Array) -> jax.Array:
     """
     theta1 = jnp.mod(x[..., 0], 2 * jnp.pi) - jnp.pi
     theta2 = jnp.mod(x[..., 1] + jnp.pi, 2 * jnp.pi) - jnp.pi
-    off = jnp.stack([theta1, theta2, x[..., 2], x[..., 3]], axis=-1)
-    return jnp.all(jnp.abs(off) < jnp.asarray(EPSILON, x.dtype), axis=-1)
+    off = (theta1, theta2, x[..., 2], x[..., 3])
+    within = [jnp.abs(part) < most for part, most in zip(off, EPSILON, strict=True)]
+    return jnp.all(jnp.stack(within), axis=0)

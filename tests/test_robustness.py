@@ -256,6 +256,14 @@ def test_mildest_failure_is_a_failure_and_harmless_ranges_have_none(dtype):
     }  # fmt: skip
 
 
+def test_sweeps_promote_no_rank():
+    """Of users who have jax refuse what may be a mistake of theirs."""
+    with jax.numpy_rank_promotion("raise"):
+        found = survey(NEAR_UPRIGHT, BALANCE, {"delay": [0.0, 0.004]}, KEY, duration=0.2)
+        mildest_failure(NEAR_UPRIGHT, BALANCE, {"delay": (0, 0.004)}, KEY, samples=2, duration=0.2)
+    np.testing.assert_array_equal(found.success, [1, 1])
+
+
 PLANT = competition("pendubot")
 BROKEN = PLANT.replace(mass=np.array([0.5, np.nan], "f4"))
 
