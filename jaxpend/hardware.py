@@ -87,9 +87,8 @@ def draw(
 ) -> Scenario:
     """A robot with its sensors and motor; ``key`` is consumed, ``pushed`` is a bool (), traced.
 
-    Pushes end 2 s before the end of a run of ``duration`` s, so that it can stand after them; in
-    a run shorter than 10 s they lie closer together, and that time is shorter by as much. Delays
-    are in steps of ``dt`` s.
+    Pushes end 2 s before the end of a run of ``duration`` s, so that it can stand after them; one
+    shorter than 10 s has them, and that time, as much closer. Delays are in steps of ``dt`` s.
     """
     keys = dict(zip(("plant", "rest", "pulses"), jax.random.split(key, 3), strict=True))
     parts = jax.random.uniform(keys["plant"], (6, 2), minval=-1.0, maxval=1.0)

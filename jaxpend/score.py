@@ -287,7 +287,8 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
         )
     with jax.enable_x64(True):
         # As arrays: of lists, jax would take every number for an argument of its own.
-        return _plain(_criteria(in_default(Trajectory(t - began, x, u, x, u)), task), task)
+        arrays = Trajectory(t - began, x, u, x, u)  # type: ignore[arg-type]
+        return _plain(_criteria(in_default(arrays), task), task)
 
 
 def _plain(c: Criteria, task: Task) -> dict[str, Any]:
