@@ -453,19 +453,21 @@ WEIGHTS = np.sin(np.arange(80.0)).reshape(20, 4)
 
 
 def shifted(carry, t, x):
-    now, before = carry
+    now, before = carry["now */"], carry["before"]
     new = jnp.tanh(WEIGHTS @ x)
-    return (new, now), (new - before)[:2]
+    return {"now */": new, "before": now}, (new - before)[:2]
 
 
 def swapped(carry, t, x):
-    first, second = carry
-    return (second, first), first[:2] + x[:2]
+    first, second = carry["now */"], carry["before"]
+    return {"now */": second, "before": first}, first[:2] + x[:2]
 
 
 @pytest.mark.parametrize(("law", "size"), [(shifted, 20), (swapped, 40)])
 def test_memory_that_moves_on_is_read_before_it_is_overwritten(tmp_path, law, size):
-    start = lambda: (jnp.zeros(size), jnp.arange(size) / 8)  # noqa: E731
+    def start():
+        return {"now */": jnp.zeros(size), "before": jnp.arange(size) / 8}
+
     check_everywhere(Remembering(start, law), tmp_path)
 
 

@@ -130,6 +130,11 @@ def source(
     return _Printer(program, arithmetic).text(prefix)
 
 
+def _said(text: str) -> str:
+    """A name of the user's, which must not end the comment that it is in."""
+    return text.replace("*/", "* /")
+
+
 class _Printer:
     """Prints one program with one arithmetic; {p} stands for the prefix until the end."""
 
@@ -161,7 +166,7 @@ class _Printer:
         text, init = "\n".join(step), "\n".join(self.initial())
         total, calls = self.counted()
         fields = [
-            f"    {self.types[leaf.kind]} s{number}[{leaf.initial.size}]; /* {leaf.path} */"
+            f"    {self.types[leaf.kind]} s{number}[{leaf.initial.size}]; /* {_said(leaf.path)} */"
             for number, leaf in enumerate(program.state)
         ]
         state = sum(self.width[leaf.kind] * leaf.initial.size for leaf in program.state)

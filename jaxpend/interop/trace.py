@@ -53,12 +53,9 @@ def trace(controller: Controller, precision: str) -> Program:
             text = f"{name} cannot be exported: it cannot be called in {precision}: {blame(error)}"
             raise JaxpendError(text) from error
         initial = [np.asarray(leaf) for leaf in leaves]
-    for (path, _), value in zip(paths, initial, strict=True):
-        if not value.size:
-            where = jax.tree_util.keystr(path)
-            raise JaxpendError(
-                f"{name} cannot be exported: its memory{where} has no entries; leave it out"
-            )
+    if empty := [path for (path, _), value in zip(paths, initial, strict=True) if not value.size]:
+        where = f"its memory{jax.tree_util.keystr(empty[0])} has no entries; leave it out"
+        raise JaxpendError(f"{name} cannot be exported: {where}")
     builder = Builder(precision)
     translate = Translator(builder, name, RULES)
     state = [
