@@ -240,7 +240,10 @@ def own_task(controller: Any, task: Task | None = None) -> Task:
 
 
 def board(robot_or_board: "str | Board") -> Board:
-    """A board itself, or by a robot's name its v2 board."""
+    """A board itself, or by a robot's name its v2 board. Raises ``JaxpendError`` for a task."""
+    if isinstance(robot_or_board, Task):
+        text = "a task is no board; give a board, such as v2(robot), or Board(name, task, None)"
+        raise JaxpendError(text)
     return robot_or_board if isinstance(robot_or_board, Board) else v2(robot_or_board)
 
 

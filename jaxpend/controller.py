@@ -180,6 +180,15 @@ class OpenLoop(Memoryless):
     t: jax.Array  # (N,) s, increasing
     u: jax.Array  # (N, 2) N m
 
+    def check(self) -> None:
+        """Raise ``JaxpendError`` for stamps that do not rise, or not one for each torque."""
+        if isinstance(self.t, jax.core.Tracer | jax.ShapeDtypeStruct):
+            return
+        if (shapes := (np.shape(self.t), np.shape(self.u))) != ((len(self.t),), (len(self.t), 2)):
+            raise JaxpendError(f"t and u have shapes {shapes[0]} and {shapes[1]}; not (N,), (N, 2)")
+        if (np.diff(self.t) < 0).any():
+            raise JaxpendError("the time stamps of these torques go back; they must rise")
+
     def __call__(self, carry, t, x):
         """The torque of the latest stamp that is not after ``t``."""
         index = jnp.searchsorted(self.t, t, side="right") - 1

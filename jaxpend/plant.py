@@ -28,7 +28,8 @@ from .trigonometry import arctan, sincos
 __all__ = [
     "UPRIGHT", "Plant", "coriolis_matrix", "deviation", "dynamics", "euler_step",
     "forward_kinematics", "friction_vector", "gravity_vector", "joint_torque", "kinetic_energy",
-    "linearize", "mass_matrix", "potential_energy", "rk4_step", "tip_height", "total_energy",
+    "linearize", "mass_matrix", "mass_terms", "potential_energy", "rk4_step", "tip_height",
+    "total_energy",
 ]  # fmt: skip
 
 UPRIGHT = (np.pi, 0.0, 0.0, 0.0)
@@ -58,8 +59,11 @@ def _sines(x: jax.Array) -> tuple[jax.Array, ...]:
     return *sincos(x[0]), *sincos(x[0] + x[1])
 
 
-def _mass_terms(plant: Plant, cos2: jax.Array):
-    """The three distinct entries ``(m11, m12, m22)`` of the mass matrix."""
+def mass_terms(plant: Plant, cos2: jax.Array):
+    """The three distinct entries ``(m11, m12, m22)`` of the mass matrix, kg m^2, (...) each.
+
+    ``cos2`` (...) is the cosine of ``theta2``.
+    """
     m2l1 = plant.mass[1] * plant.length[0]
     coupling = m2l1 * plant.com[1] * cos2
     ir, gr = plant.motor_inertia, plant.gear_ratio
@@ -72,7 +76,7 @@ def _mass_terms(plant: Plant, cos2: jax.Array):
 
 def mass_matrix(plant: Plant, x: jax.Array) -> jax.Array:
     """Mass matrix ``M(theta)``, shape (2, 2), kg m^2, for a state of shape (4,)."""
-    m11, m12, m22 = _mass_terms(plant, sincos(x[1])[1])
+    m11, m12, m22 = mass_terms(plant, sincos(x[1])[1])
     return jnp.stack([jnp.stack([m11, m12]), jnp.stack([m12, m22])])
 
 
@@ -113,7 +117,7 @@ def friction_vector(plant: Plant, x: jax.Array) -> jax.Array:
 def _accelerations(plant: Plant, theta1, theta2, omega1, omega2, u):
     """Both entries of ``alpha``. Sines and cosines are taken once."""
     (sin1, cos1), (sin2, cos2) = sincos(theta1), sincos(theta2)
-    m11, m12, m22 = _mass_terms(plant, cos2)
+    m11, m12, m22 = mass_terms(plant, cos2)
     g1, g2 = _gravity_terms(plant, sin1, sin1 * cos2 + cos1 * sin2)
     h = plant.mass[1] * plant.length[0] * plant.com[1] * sin2
     f1 = g1 + plant.actuation[0] * u[0] + h * omega2 * (2 * omega1 + omega2)
@@ -142,7 +146,7 @@ def joint_torque(torque: jax.Array, joint: int) -> jax.Array:
 
 def kinetic_energy(plant: Plant, x: jax.Array) -> jax.Array:
     """Kinetic energy ``omega' M omega / 2``, scalar, J."""
-    m11, m12, m22 = _mass_terms(plant, sincos(x[1])[1])
+    m11, m12, m22 = mass_terms(plant, sincos(x[1])[1])
     return 0.5 * (m11 * x[2] ** 2 + 2 * m12 * x[2] * x[3] + m22 * x[3] ** 2)
 
 

@@ -163,6 +163,11 @@ def test_trivial_controllers():
     run = rollout(PLANT, OpenLoop(t, u), KEY, duration=0.03)
     np.testing.assert_array_equal(run.u_command[:5, 0], 1.0)
     np.testing.assert_array_equal(run.u_command[6:, 0], 2.0)
+    check_controller(OpenLoop(t, u))
+    with refused("the time stamps of these torques go back; they must rise"):
+        check_controller(OpenLoop(t[::-1], u))
+    with refused("t and u have shapes (2,) and (1, 2); not (N,), (N, 2)"):
+        check_controller(OpenLoop(t, u[:1]))
     for controller in (Zero(), Feedback(lambda t, x: x[:2] * 0)):
         assert not np.any(rollout(PLANT, controller, KEY, duration=0.03).u)
     assert dataclasses.is_dataclass(Zero)

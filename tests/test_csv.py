@@ -137,6 +137,7 @@ ROW = "0,0,0,0,0,0,0\n"
         ("time,pos1,pos2,vel1,vel2,tau1\n", "has no column tau2; it must"),
         ("0,1,2\n3,4,5\n", "has no column time, pos_meas1, pos_meas2, vel_meas1"),
         (HEADER + "\n" + ROW + "0,0,0\n" + ROW, "line 3 has 3 values for 7 columns; it may be cut"),
+        ("\n ,\n" + HEADER + "\n" + ROW + "0,0\n", "line 5 has 2 values for 7 columns"),
         (HEADER + "\n" + ROW + "0,0,x,0,0,0,0\n", "line 3: pos_meas2 is 'x'; it must be a finite"),
         (HEADER + "\n" + ROW + "0,0,0,0,0,0,nan\n", "line 3: tau_con2 is 'nan'; it must be a fin"),
         (HEADER + "\n" + ROW + "0,0,0,inf,0,0,0\n", "line 3: vel_meas1 is 'inf'; it must be a fi"),

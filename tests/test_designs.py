@@ -92,6 +92,10 @@ def test_yaml_file(tmp_path):
         (lambda: designs.from_dict(OWN | {"I2": 0.0}), "I2 is 0.0; it must be positive"),
         (lambda: designs.from_dict(OWN | {"tl1": -1}), "tl1 is -1.0; it must not be negative"),
         (lambda: designs.from_dict([1.0]), "must be a mapping"),
+        (
+            lambda: designs.from_dict(designs.parameters("C.1/1.0") | {"I2": 0.01}),
+            "the mass matrix of these plant parameters is not positive definite; I1 and I2",
+        ),
         (lambda: designs.from_file("missing.yaml"), "missing.yaml: No such file"),
     ],
 )

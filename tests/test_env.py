@@ -450,3 +450,26 @@ def test_senseless_values_are_one_sentence(values, words):
     with pytest.raises(JaxpendError) as error:
         EnvConfig(**values)
     assert str(error.value) == words
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"config": "pendubot"}, "config is of the type str; it must be of EnvConfig"),
+        ({"task": "acrobot"}, "task is of the type str; it must be of Task"),
+        ({"task": v2("acrobot")}, "task is of the type Board; it must be of Task"),
+    ],
+)
+def test_the_brax_door_refuses_what_is_no_configuration_and_no_task(options, words):
+    with refused(words):
+        DoublePendulum(**options)
+
+
+def test_the_brax_door_takes_one_action_of_any_type():
+    env = DoublePendulum()
+    state = env.reset(jax.random.key(0))
+    after = env.step(state, np.zeros(1))
+    chex.assert_trees_all_equal_shapes_and_dtypes(after.pipeline_state, state.pipeline_state)
+    for shape in ((), (2,)):
+        with refused(f"the action has shape {shape}; it must be (1,)"):
+            env.step(state, jnp.zeros(shape))

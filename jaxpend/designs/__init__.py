@@ -17,7 +17,7 @@ import numpy as np
 from ..config_files import read_yaml
 from ..errors import JaxpendError, choose
 from ..fields import Bounds, NotNegative, Positive, checked
-from ..plant import Plant
+from ..plant import Plant, mass_terms
 from ..robots import ROBOTS, active_joint
 
 __all__ = [
@@ -98,7 +98,14 @@ def from_dict(
     values |= {"motor_inertia": p["Ir"], "gear_ratio": p["gr"]}
     # numpy, not jax, arrays: made inside a jitted function, they are still known constants.
     arrays: Any = {k: np.asarray(v, jnp.result_type(float)) for k, v in values.items()}
-    return Plant(**arrays)
+    plant = Plant(**arrays)
+    # The determinant is concave in cos(theta2), so that its ends are its least.
+    ends: Any = np.array([-1.0, 1.0])
+    m11, m12, m22 = mass_terms(plant, ends)
+    if not (m11 * m22 > m12**2).all():
+        text = "the mass matrix of these plant parameters is not positive definite"
+        raise JaxpendError(f"{text}; I1 and I2 are about the joints, I2 at least m2 r2^2")
+    return plant
 
 
 def read(path: str | Path) -> dict[str, float]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from ..boards import v2
 from ..env import Env as Functions
 from ..env import EnvConfig, EnvState
+from ..errors import JaxpendError
 from ..task import Task
 
 # MuJoCo, which Brax loads, prints what it lacks to standard output.
@@ -29,7 +30,14 @@ class DoublePendulum(Env):
     """
 
     def __init__(self, config: EnvConfig | None = None, task: Task | None = None):
-        """By default the pendubot of the v2 board, and the default configuration."""
+        """By default the pendubot of the v2 board, and the default configuration.
+
+        Raises ``JaxpendError`` for what is no configuration or task, and as ``env.Env``.
+        """
+        for name, given, kind in (("config", config, EnvConfig), ("task", task, Task)):
+            if not isinstance(given, kind | None):
+                what = f"{name} is of the type {type(given).__name__}"
+                raise JaxpendError(f"{what}; it must be of {kind.__name__}")
         self.functions = Functions(config or EnvConfig(), task or v2("pendubot").task)
 
     def reset(self, rng: jax.Array) -> State:
@@ -39,7 +47,11 @@ class DoublePendulum(Env):
 
     def step(self, state: State, action: jax.Array) -> State:
         """One control period; ``action`` (1,) is clipped to [-1, 1] and held."""
-        now = self.functions.step(state.pipeline_state, action[0])
+        if (shape := jnp.shape(action)) != (1,):
+            raise JaxpendError(f"the action has shape {shape}; it must be (1,): vmap over batches")
+        # Of the type of the one before, so that a scan keeps the types of its carry.
+        before = state.pipeline_state
+        now = self.functions.step(before, jnp.asarray(action, before.action.dtype)[0])
         return state.replace(pipeline_state=now, obs=self._observation(now), reward=now.reward)
 
     def _observation(self, now: EnvState) -> jax.Array:

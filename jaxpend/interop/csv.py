@@ -35,6 +35,8 @@ def load_csv(path: str | Path) -> Trajectory:
             that is no finite number, fewer than three rows, or time that goes backwards.
     """
     rows = _rows(path)
+    blank = next((place for place, row in enumerate(rows) if any(map(str.strip, row))), 0)
+    rows = rows[blank:]
     names = [name.strip() for name in rows[0]] if rows else []
     if not names:
         raise JaxpendError(f"{path} is empty; it must have the columns {HEADER}")
@@ -51,7 +53,9 @@ def load_csv(path: str | Path) -> Trajectory:
         raise JaxpendError(f"{path} has the column {twice[0]} twice; which one counts is not clear")
     columns = [names.index(name) for name in ("time", *kind)]
     numbers = [
-        _numbers(path, line, row, names, columns) for line, row in enumerate(rows[1:], 2) if row
+        _numbers(path, line, row, names, columns)
+        for line, row in enumerate(rows[1:], blank + 2)
+        if row
     ]
     if len(numbers) < 3:
         count = len(numbers)
