@@ -210,8 +210,7 @@ def overview() -> str:
         lines += [f"  {n:<12} {c.summary}" for n, c in COMMANDS.items() if c.group == group]
     lines += ["", "example:", f"  jaxpend train {COMMANDS['train'].example}", ""]
     lines += ["jaxpend COMMAND --help lists a command's options, jaxpend --version the versions."]
-    lines += [f"Compiled programs are kept in the user's cache folder: {VARIABLE}=FOLDER moves"]
-    lines += [f"them, {VARIABLE}=off keeps none."]
+    lines += [f"{VARIABLE}=FOLDER: where compiled programs are kept; {VARIABLE}=off: none are."]
     return "\n".join(lines)
 
 
