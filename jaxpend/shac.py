@@ -10,8 +10,8 @@ a step each of them moves on by a window of T seconds, and Adam climbs the mean 
 
 with ``up`` in [0, 1] a smooth form of "above the line", h the horizon, and V a critic of what
 comes after the window: how much of the time, discounted likewise, the arm will be up. The critic
-learns by TD(lambda) from the same windows. Then the arms are kicked a little, and some
-are thrown, or put anywhere.
+learns by TD(lambda) from the same windows. Then the arms are kicked a little, and some are thrown,
+or put anywhere.
 """
 
 import math
@@ -37,7 +37,7 @@ from .pytree import Pytree, pytree
 from .resets import thrown
 from .rollout import rollout
 from .sac.networks import Params, Trunk
-from .scenario import Scenario
+from .scenario import DT, Scenario
 from .stage import Candidates, Chart, Row, SearchStage, SearchState
 from .task import Task
 from .variations import LONGEST_DELAY
@@ -94,7 +94,7 @@ def window(config: SHACConfig, task: Task, x: jax.Array, key: jax.Array) -> Scen
         return Scenario(task.plant, x0=x)
     scenario = task.imperfect(task.plant, key, config.randomised)
     assert scenario.delay is not None
-    steps = jnp.round(scenario.delay * (task.dt / config.dt)).astype(jnp.int32)
+    steps = jnp.round(scenario.delay * (DT / config.dt)).astype(jnp.int32)  # it counts in DT
     return scenario.replace(x0=x, delay=steps)
 
 
@@ -105,7 +105,7 @@ def ahead(
     """What a window is worth (), and its states (T + 1, 4); ``key`` is consumed."""
     options: dict[str, Any] = {"dt": config.dt, "duration": config.window}
     if config.randomised:
-        options["delay_slots"] = math.ceil(LONGEST_DELAY * task.dt / config.dt) + 1
+        options["delay_slots"] = math.ceil(LONGEST_DELAY * DT / config.dt) + 1
     states = rollout(scenario, policy, key, **options).x
     decay = np.exp(-config.dt / config.horizon)
     worth = (1 - decay) * decay ** np.arange(len(states) - 1) @ up(config, task, states[1:])

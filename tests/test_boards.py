@@ -5,7 +5,7 @@ import pytest
 from conftest import refused
 
 from jaxpend import designs
-from jaxpend.boards import task_of, v2
+from jaxpend.boards import board, task_of, v2
 
 OWN = {"m1": 0.5, "m2": 0.6, "l1": 0.2, "l2": 0.3, "r1": 0.2, "r2": 0.3, "I1": 0.03, "I2": 0.05}
 
@@ -53,3 +53,8 @@ def test_what_names_no_plant_is_one_sentence(tmp_path):
         task_of("acrobot", "a", "C.1/1.0")
     with refused("unknown robot"):
         task_of("cartpole")
+
+
+def test_a_task_is_no_board():
+    with refused("a task is no board; give a board, such as v2(robot)"):
+        board(v2("acrobot").task)

@@ -425,6 +425,26 @@ def test_a_table_is_printed_where_not_all_of_its_letters_are_known(monkeypatch):
     assert written.buffer.getvalue() == b"N?m?s 1\n"
 
 
+def test_a_folder_that_is_gone_is_said(tmp_path):
+    gone = tmp_path / "gone"
+    there = f"mkdir {gone}; cd {gone}; rmdir {gone}; jaxpend score --controller pd --json found"
+    done = command(there, PYTHONPATH=str(Path(__file__).parents[1]))
+    words = "jaxpend score: the current folder is gone; change to one that is there\n"
+    assert (done.returncode, done.stderr.endswith(words)) == (2, True)
+
+
+def test_progress_is_not_among_the_results_where_standard_error_is_closed(monkeypatch, capsys):
+    def find(task, search, say):
+        say("found")
+        report = {"criteria": {"swingup_time": 1.0}, "turns_of_theta2": 0, "score": 0.5}
+        return [(None, report)]
+
+    monkeypatch.setattr("jaxpend.trajopt.search.find", find)
+    monkeypatch.setattr("sys.stderr", None)
+    commands.optimise("pendubot", "jaxpend optimise", json="-")
+    assert json.loads(capsys.readouterr().out)["optima"][0]["score"] == 0.5
+
+
 @pytest.mark.parametrize("columns", ["0", "1", "-5", "wide"])
 def test_a_terminal_with_no_room_is_written_beyond(runs, columns):
     for line in ("--help", "train --help", "robustness -H"):

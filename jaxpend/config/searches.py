@@ -1,4 +1,4 @@
-"""What searches from a policy: openings, the gradient, SNES; the guard; trajectory optimisation."""
+"""What searches from a policy: openings, gradient, SHAC, SNES; the guard; the best trajectory."""
 
 import dataclasses
 from typing import Annotated, Literal
