@@ -46,14 +46,25 @@ REDUCTIONS = {
     "reduce_and": "and", "reduce_or": "or",
 }  # fmt: skip
 RUNNING = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
+# Of truth values; of integers they would be operations on bits.
+LOGIC = {"and": "and", "or": "or", "xor": "ne", "not": "not"}
+# Where the first entry is that no other is better than, in this sense.
+POSITIONS = {"argmax": "gt", "argmin": "lt"}
+# Entry by entry, by other operations on the one argument.
+COMPOSED: dict[str, Callable[[Translator, Array], Array]] = {
+    "square": lambda tr, a: tr.op("mul", a, a),
+    "rsqrt": lambda tr, a: tr.op("div", tr.constant(1.0), tr.op("sqrt", a)),
+    "expm1": lambda tr, a: tr.op("sub", tr.op("exp", a), tr.constant(1.0)),
+    "tan": lambda tr, a: tr.op("div", tr.op("sin", a), tr.op("cos", a)),
+}
 RULES: dict[str, Callable[[Translator, list[Array], Params, Shape], Any]] = {}
 
 
-def rule(*names: str) -> Callable:
-    """Enter a function for the primitives of these names."""
+def rule(name: str) -> Callable:
+    """Enter a function for the primitive of that name."""
 
     def enter(function: Callable) -> Callable:
-        RULES.update(dict.fromkeys(names, function))
+        RULES[name] = function
         return function
 
     return enter
@@ -86,12 +97,32 @@ def _running(op: str) -> Callable:
     return lambda tr, args, p, shape: running(tr, args[0], op, p["axis"], p["reverse"])
 
 
+def _logic(op: str) -> Callable:
+    def logic(tr, args, p, shape):
+        if any(arg.size and arg.kind != "bool" for arg in args):
+            raise tr.refuse("it works on the bits of integers")
+        return tr.op(op, *args)
+
+    return logic
+
+
+def _position(better: str) -> Callable:
+    return lambda tr, args, p, shape: position(tr, args[0], better, p["axes"], shape)
+
+
+def _composed(how: Callable[[Translator, Array], Array]) -> Callable:
+    return lambda tr, args, p, shape: how(tr, args[0])
+
+
 RULES |= {name: _same(op) for name, op in SAME.items()}
 RULES |= {name: _call(field) for name, field in CALLS.items()}
 RULES |= {name: lambda tr, args, p, shape: args for name in IDENTITIES}
 RULES |= {name: _moved(how) for name, how in MOVES.items()}
 RULES |= {name: _reduction(op) for name, op in REDUCTIONS.items()}
 RULES |= {name: _running(op) for name, op in RUNNING.items()}
+RULES |= {name: _logic(op) for name, op in LOGIC.items()}
+RULES |= {name: _position(better) for name, better in POSITIONS.items()}
+RULES |= {name: _composed(how) for name, how in COMPOSED.items()}
 
 
 def _called(tr: Translator, inner: Any, args: list[Array]) -> list[Array]:
@@ -128,30 +159,10 @@ def _integer_pow(tr, args, p, shape):
     return tr.op("div", tr.constant(1.0), result) if power < 0 else result
 
 
-@rule("square")
-def _square(tr, args, p, shape):
-    return tr.op("mul", args[0], args[0])
-
-
-@rule("rsqrt")
-def _rsqrt(tr, args, p, shape):
-    return tr.op("div", tr.constant(1.0), tr.op("sqrt", args[0]))
-
-
 @rule("logistic")
 def _logistic(tr, args, p, shape):
     one = tr.constant(1.0)
     return tr.op("div", one, tr.op("add", one, tr.op("exp", tr.op("neg", args[0]))))
-
-
-@rule("expm1")
-def _expm1(tr, args, p, shape):
-    return tr.op("sub", tr.op("exp", args[0]), tr.constant(1.0))
-
-
-@rule("tan")
-def _tan(tr, args, p, shape):
-    return tr.op("div", tr.op("sin", args[0]), tr.op("cos", args[0]))
 
 
 @rule("clamp")
@@ -174,32 +185,6 @@ def _convert(tr, args, p, shape):
     if dtype.kind not in KINDS:
         raise tr.refuse(f"it uses numbers of the type {dtype}")
     return tr.op(KINDS[dtype.kind], args[0])
-
-
-@rule("and")
-def _and(tr, args, p, shape):
-    return _logic(tr, "and", args)
-
-
-@rule("or")
-def _or(tr, args, p, shape):
-    return _logic(tr, "or", args)
-
-
-@rule("xor")
-def _xor(tr, args, p, shape):
-    return _logic(tr, "ne", args)
-
-
-@rule("not")
-def _not(tr, args, p, shape):
-    return _logic(tr, "not", args)
-
-
-def _logic(tr: Translator, op: str, args: list[Array]) -> Array:
-    if any(arg.size and arg.kind != "bool" for arg in args):
-        raise tr.refuse("it works on the bits of integers")
-    return tr.op(op, *args)
 
 
 @rule("select_n")
@@ -320,16 +305,6 @@ def _looked_up(tr, operand, axes, starts, sizes, within) -> Array:
 @rule("dot_general")
 def _dot_general(tr, args, p, shape):
     return dot_general(tr, args, p["dimension_numbers"], shape)
-
-
-@rule("argmax")
-def _argmax(tr, args, p, shape):
-    return position(tr, args[0], "gt", p["axes"], shape)
-
-
-@rule("argmin")
-def _argmin(tr, args, p, shape):
-    return position(tr, args[0], "lt", p["axes"], shape)
 
 
 # Control
