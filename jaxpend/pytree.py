@@ -53,12 +53,12 @@ def check_constant(hint: Any, value: Any, name: str) -> None:
 
 
 def in_default(tree: T) -> T:
-    """A pytree with its floating-point and whole numbers in jax's default types of them."""
+    """A pytree of jax's arrays, floating-point and whole numbers in its default types of them."""
 
     def converted(leaf: Any) -> Any:
         for kind, default in ((jnp.floating, float), (jnp.signedinteger, int)):
             if jnp.issubdtype(jnp.result_type(leaf), kind):
                 return jnp.asarray(leaf, jnp.result_type(default))
-        return leaf
+        return jnp.asarray(leaf)
 
     return jax.tree.map(converted, tree)

@@ -1,7 +1,5 @@
 """From a controller to a ``Program``: jax traces one step, and its operations are translated."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +7,7 @@ import numpy as np
 from ..controller import Controller, check_controller
 from ..controllers.policy import change_policies
 from ..errors import THEIRS, JaxpendError, blame, choose
+from ..pytree import in_default
 from .program import KINDS, Builder, Leaf, Node, Program
 from .rules import RULES
 from .translate import SMALL, Array, Translator
@@ -38,7 +37,7 @@ def trace(controller: Controller, precision: str) -> Program:
     controller, _ = change_policies(controller, lambda policy: policy.replace(action_noise=None))
     name = type(controller).__name__
     with jax.enable_x64(precision == "float64"):
-        controller = jax.tree.map(lambda leaf: _in(precision, leaf), controller)
+        controller = in_default(controller)
         carry = controller.reset(jax.random.key(0))
         paths, structure = jax.tree_util.tree_flatten_with_path(carry)
         leaves = [jnp.asarray(leaf) for _, leaf in paths]
@@ -78,15 +77,6 @@ def trace(controller: Controller, precision: str) -> Program:
             f"most {MOST} can be written one by one"
         )
     return program
-
-
-def _in(precision: str, leaf: Any) -> jax.Array:
-    """A leaf of a controller, in the types that it has where ``precision`` is jax's default."""
-    given = jnp.result_type(leaf)
-    if jnp.issubdtype(given, jnp.floating):
-        return jnp.asarray(leaf, precision)
-    whole = jnp.issubdtype(given, jnp.signedinteger)
-    return jnp.asarray(leaf, jnp.result_type(int) if whole else None)
 
 
 def _variable(builder: Builder, number: int, leaf: Leaf, shape: tuple[int, ...]) -> Array:
