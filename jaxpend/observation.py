@@ -11,9 +11,11 @@ from .fields import Bounds, Checked, Positive, Scale
 if TYPE_CHECKING:
     import jax
 
-__all__ = ["KINDS", "History", "Observation"]
+__all__ = ["KINDS", "History", "Observation", "Seen"]
 
 History = Annotated[int, Bounds(least=0, most=1000)]
+# What a policy of another tool may have seen of a state.
+Seen = Literal["wrapped", "sincos", "sincos_clipped", "sincos_by_joint", "state", "angles"]
 
 
 def _wrapped(x: jax.Array, max_velocity: float) -> jax.Array:

@@ -6,12 +6,10 @@ from typing import Literal
 from ..config import Activation
 from ..errors import JaxpendError
 from ..fields import Period, Robot, Scale
-from ..observation import History
+from ..observation import History, Seen
 from .output import check_file
 
 __all__ = ["import_"]
-
-Seen = Literal["wrapped", "sincos", "sincos_clipped", "sincos_by_joint", "state", "angles"]
 
 
 def import_(

@@ -22,7 +22,7 @@ from ..config import Activation, EnvConfig
 from ..controllers.policy import Policy
 from ..errors import JaxpendError, choose
 from ..fields import Checked, Period, Scale
-from ..observation import History, Observation
+from ..observation import History, Observation, Seen
 from ..robots import ROBOTS
 from .tensors import MOST_PICKLE, MOST_TENSORS, Name, StateDict, array, description, member, shown
 
@@ -71,9 +71,7 @@ class Convention(Checked):
     ``angles`` cosines and sines alone. What was seen of the past is as ``Observation`` has it.
     """
 
-    observation: Literal[
-        "wrapped", "sincos", "sincos_clipped", "sincos_by_joint", "state", "angles"
-    ]
+    observation: Seen
     max_velocity: Scale  # rad/s, velocities are divided by it, and clipped there if clipped
     torque_limit: Scale  # N m, torque at the largest action
     statistics: str | None = None  # file, see ``read_statistics``; None: it does not normalise
