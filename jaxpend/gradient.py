@@ -42,7 +42,7 @@ from .pytree import Pytree, pytree
 from .retention import Retained, change, check_time, retained
 from .rollout import rollout
 from .scenario import Scenario
-from .stage import Candidates, Chart, Row, SearchStage, SearchState, Stage
+from .stage import Candidates, Chart, Row, SearchStage, SearchState, Stage, ranked
 from .task import Task
 from .trajopt.swingup import SwingUp, smooth_score, totals
 
@@ -273,9 +273,8 @@ class Gradient(SearchStage):
 
     def begin(self, seed: int, controller: Controller) -> SearchState:
         key = jax.random.fold_in(jax.random.key(seed), 2)
-        return SearchState(
-            controller, init(self.config, controller, key, self.task), jnp.asarray(0)
-        )
+        search = init(self.config, controller, key, self.task)
+        return SearchState(controller, search, jnp.asarray(0))
 
     def search(self, states: list[SearchState], count: int) -> list[tuple[GradientState, Row]]:
         chunk = partial(improve, self.config, steps=count, task=self.task)
@@ -305,9 +304,8 @@ class Gradient(SearchStage):
         policy = current(self.config, state.start, state.search)
         if metrics:
             return metrics, [(policy, float(state.search.worth))]
-        score, worth = self.compared(policy)
-        row = {"score": score, "value": worth, "lost": int(state.search.lost)}
-        return row, [(policy, worth)]
+        row = self._settled(state)[1]
+        return row, [(policy, row["value"])]
 
     def note(self, row: Row) -> str:
         return f"smooth score {float(row['smooth_score']):.4f}  score {row['score']:.4f}"
@@ -338,7 +336,7 @@ class Contest(Stage[tuple[Controller, ...], ContestState, Controller]):
     def __init__(self, config: GradientConfig, policy: Any, task: Task, contestants: int):
         self.inner, self.contestants = Gradient(config, policy, task), contestants
         self.config, self.policy, self.total = config, policy, config.steps
-        self.objective = config.objective
+        self.objective, self.task = config.objective, task
 
     def start(self, seed: int, before: tuple[Controller, ...]) -> ContestState:
         each = tuple(self.inner.start(seed, controller) for controller in before)
@@ -363,9 +361,8 @@ class Contest(Stage[tuple[Controller, ...], ContestState, Controller]):
         return [self._advanced(state) for state in states]
 
     def _advanced(self, state: ContestState) -> tuple[ContestState, Row]:
-        order = np.argsort(-np.asarray(state.worths), kind="stable")
-        each, worths, rows = list(state.each), np.full(len(order), -np.inf, "f4"), []
-        for i in map(int, order[: self.kept(self.done(state))]):
+        each, worths, rows = list(state.each), np.full(len(state.each), -np.inf, "f4"), []
+        for i in ranked(state.worths)[: self.kept(self.done(state))]:
             [(each[i], row)] = self.inner.advance([each[i]])
             worths[i] = each[i].search.best.worth
             rows.append(row)
@@ -378,8 +375,7 @@ class Contest(Stage[tuple[Controller, ...], ContestState, Controller]):
             judged = [self.inner.judge(one, metrics) for one in state.each]
             candidates = [candidate for _, [candidate] in judged]
             return max((row for row, _ in judged), key=lambda row: row["value"]), candidates
-        order = [int(i) for i in np.argsort(-np.asarray(state.worths), kind="stable")]
-        still = [state.each[i] for i in order if np.isfinite(state.worths[i])]
+        still = [state.each[i] for i in ranked(state.worths) if np.isfinite(state.worths[i])]
         return metrics, [self.inner.judge(one, metrics)[1][0] for one in still]
 
     def note(self, row: Row) -> str:

@@ -32,7 +32,7 @@ from .retention import change, check_time, retained, seen
 from .rollout import rollout
 from .scenario import Scenario
 from .score import nominal, performance
-from .stage import Candidates, Chart, Row, Stage, value
+from .stage import Candidates, Chart, Row, Stage, ranked
 from .task import Task
 
 __all__ = ["Opened", "Openings", "OpeningsConfig", "OpeningsState", "chosen", "explore", "learn"]
@@ -111,7 +111,7 @@ def chosen(times: np.ndarray, scores: np.ndarray, own: float, count: int) -> lis
     policy or of a better one.
     """
     taken, found = [own], list[int]()
-    for i in map(int, np.argsort(-scores, kind="stable")):
+    for i in ranked(scores):
         if len(found) == count or not scores[i] > 0:
             break
         if all(abs(times[i] - other) >= APART for other in taken):
@@ -234,11 +234,6 @@ class Openings(Stage[Any, OpeningsState, tuple[Controller, ...]]):
     def done(self, state: OpeningsState) -> int:
         return int(state.done)
 
-    def compared(self, policy: Policy) -> tuple[float, float]:
-        """The official score of a policy, and what it is compared by."""
-        score = float(self.task.score(nominal(policy, self.task)))
-        return score, value(self.objective, policy, score, self.task)
-
     def advance(self, states: list[OpeningsState]) -> list[tuple[OpeningsState, Row]]:
         return [self._tried(state) for state in states]
 
@@ -275,9 +270,9 @@ class Openings(Stage[Any, OpeningsState, tuple[Controller, ...]]):
         if not metrics:
             score, worth = self.compared(state.policies[0])
             return {"score": score}, [(state.policies[0], worth)]
-        order = np.argsort(-np.asarray(state.worths), kind="stable")
         worths = [float(worth) for worth in state.worths]
-        return metrics, [(state.policies[i], worths[i]) for i in order if np.isfinite(worths[i])]
+        judged = [i for i in ranked(worths) if np.isfinite(worths[i])]
+        return metrics, [(state.policies[i], worths[i]) for i in judged]
 
     def note(self, row: Row) -> str:
         if not row["learned"]:
@@ -294,5 +289,4 @@ class Openings(Stage[Any, OpeningsState, tuple[Controller, ...]]):
 
     def outcome(self, state: OpeningsState, best: Controller) -> tuple[Controller, ...]:
         """All of them, the best first."""
-        order = np.argsort(-np.asarray(state.worths), kind="stable")
-        return tuple(state.policies[i] for i in order)
+        return tuple(state.policies[i] for i in ranked(state.worths))

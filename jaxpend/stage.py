@@ -12,6 +12,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from . import devices
 from .config import Objective, Run
@@ -21,7 +22,10 @@ from .pytree import Pytree, pytree
 from .score import combined, imperfect, nominal
 from .task import Task
 
-__all__ = ["Candidates", "Chart", "Row", "SearchStage", "SearchState", "Stage", "standing", "value"]
+__all__ = [
+    "Candidates", "Chart", "Row", "SearchStage", "SearchState", "Stage", "ranked", "standing",
+    "value",
+]  # fmt: skip
 
 Row = dict[str, Any]  # of metrics
 Candidates = list[tuple[Controller, float]]  # with their scores
@@ -52,6 +56,7 @@ class Stage(Protocol[Before, State, After]):
     scores: ClassVar[tuple[str, ...]] = ()  # columns of the metrics with official scores
     ties: ClassVar[bool] = False  # whether a policy as good as the best replaces it
 
+    task: Task  # on which ``compared`` scores
     total: int
     objective: Objective = Objective()  # what candidates are compared by, see ``value``
 
@@ -87,6 +92,11 @@ class Stage(Protocol[Before, State, After]):
     def judge(self, state: State, metrics: Row) -> tuple[Row, Candidates]:
         """A row of metrics, and controllers with their scores, the last one of training first."""
 
+    def compared(self, controller: Controller) -> tuple[float, float]:
+        """The official score of a candidate, and what it is compared by."""
+        score = float(self.task.score(nominal(controller, self.task)).mean())
+        return score, value(self.objective, controller, score, self.task)
+
     def note(self, row: Row) -> str:
         """What a row of metrics says, for people."""
 
@@ -99,6 +109,14 @@ class Stage(Protocol[Before, State, After]):
     def outcome(self, state: State, best: Any) -> After:
         """What the next stage starts from: the best controller."""
         return best
+
+
+def ranked(worths: Any) -> list[int]:
+    """The numbers of several controllers, the one that is worth most first; as they were if even.
+
+    ``worths`` (n,) are what they are compared by.
+    """
+    return [int(i) for i in np.argsort(-np.asarray(worths), kind="stable")]
 
 
 # --- searches on the score -----------------------------------------------------------------
@@ -195,11 +213,6 @@ class SearchStage(Stage[Controller, SearchState, Controller]):
             (state.replace(search=search, done=state.done + count), metrics)
             for state, (search, metrics) in zip(states, self.search(states, count), strict=True)
         ]
-
-    def compared(self, controller: Controller) -> tuple[float, float]:
-        """The official score of a candidate, and what it is compared by."""
-        score = float(self.task.score(nominal(controller, self.task)).mean())
-        return score, value(self.objective, controller, score, self.task)
 
     def rekey(self, state: SearchState, number: int) -> SearchState:
         key = jax.random.fold_in(state.search.key, number)

@@ -11,7 +11,7 @@ from ..config import Run, SACConfig
 from ..controller import Controller
 from ..pytree import Pytree, pytree
 from ..score import nominal
-from ..stage import Candidates, Chart, Row, Stage, value
+from ..stage import Candidates, Chart, Row, Stage, ranked, value
 from ..task import Task
 from . import algorithm
 from .algorithm import Agent, SACState
@@ -37,7 +37,8 @@ class Imitation(Stage[None, ImitationState, SACState]):
     CHUNK = 2000  # updates
 
     def __init__(self, config: SACConfig, task: Task):
-        self.agent, self.total = Agent(config, task), config.demonstrations.updates
+        self.agent, self.task = Agent(config, task), task
+        self.total = config.demonstrations.updates
 
     @classmethod
     def of(cls, run: Run, start: Controller | None, task: Task) -> Self | None:
@@ -182,7 +183,7 @@ class Contestants(Stage[SACState | None, ContestantsState, tuple[Controller, ...
 
     def __init__(self, config: SACConfig, task: Task):
         self.inner, self.agent, self.total = SAC(config, task), Agent(config, task), config.steps
-        self.objective = config.objective
+        self.objective, self.task = config.objective, task
 
     def _unjudged(self, sac: SACState) -> ContestantsState:
         count = self.agent.config.contestants
@@ -233,5 +234,4 @@ class Contestants(Stage[SACState | None, ContestantsState, tuple[Controller, ...
 
     def outcome(self, state: ContestantsState, best: Controller) -> tuple[Controller, ...]:
         """The best policies, the best of all first."""
-        order = sorted(range(len(state.policies)), key=lambda i: -float(state.worths[i]))
-        return tuple(state.policies[i] for i in order)
+        return tuple(state.policies[i] for i in ranked(state.worths))
