@@ -18,7 +18,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from . import hosts
 from .errors import JaxpendError
 
-__all__ = ["asked", "compute", "everywhere", "split", "spread", "together", "use"]
+__all__ = ["asked", "compute", "everywhere", "pieces", "split", "spread", "together", "use"]
 
 AXIS = "rows"
 _asked = 0
@@ -94,13 +94,11 @@ def compute(function: Callable[..., Any], *args: Any, **static: Any) -> Any:
     if _mesh() is None:
         return function(*args, **static)
     here = jax.local_devices()[0]
-    if jax.process_count() == 1:
-        with together(*args):
-            found = function(*everywhere(args), **static)
-        return jax.device_put(found, here)
     with hosts.guarded():
         with together(*args):
             found = function(*everywhere(args), **static)
+        if jax.process_count() == 1:
+            return jax.device_put(found, here)
         own = jax.tree.map(lambda leaf: leaf.addressable_data(0), found)
         return jax.block_until_ready(jax.device_put(own, here))
 
@@ -149,6 +147,16 @@ def split(function: Callable[..., Any], *same: Any) -> Callable[..., Any]:
         return jax.lax.with_sharding_constraint(found, PartitionSpec())
 
     return shared
+
+
+def pieces(count: int, most: int) -> Iterator[np.ndarray]:
+    """The numbers of rows in pieces of at most ``most``, for a loop over one compiled program.
+
+    All are as long as the first: the last one is filled up with copies of the last row.
+    """
+    size = min(most, count)
+    for first in range(0, count, size):
+        yield np.minimum(np.arange(first, first + size), count - 1)
 
 
 def spread(tree: Any, axis: int = 0) -> Any:

@@ -164,12 +164,10 @@ def judge_fleet(
     check_robot(controller, task.robot)
     check_controller(controller)
     keys, parts = jax.random.split(key, robots), []
-    for first in range(0, robots, CHUNK):
-        # Filled up, so that all chunks share one program.
-        rows = np.minimum(np.arange(first, first + min(CHUNK, robots)), robots - 1)
+    for rows in devices.pieces(robots, CHUNK):
         found = devices.compute(_tried, controller, keys[rows], task=task)
         parts.append(jax.tree.map(np.asarray, found))
-        say(min(first + CHUNK, robots))
+        say(int(rows[-1]) + 1)
     stands, score, down, diverged = (
         np.concatenate([part[0][i] for part in parts])[:robots].T for i in range(4)
     )

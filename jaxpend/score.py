@@ -178,10 +178,7 @@ def official(controller: Controller, judged_on: Board | str) -> dict[str, Any]:
     task, found = judged_on.task, []
     with jax.enable_x64(False):
         ready = _ready(controller, task)
-        for first in range(0, judged_on.draws, CHUNK):
-            # The last ones are filled up, so that all share one program.
-            seeds = np.arange(first, first + min(CHUNK, judged_on.draws))
-            seeds = np.minimum(seeds, judged_on.draws - 1)
+        for seeds in devices.pieces(judged_on.draws, CHUNK):
             scenarios = [judged_on.drawn(seed) for seed in seeds.tolist()]
             batch = jax.tree.map(lambda *leaves: np.stack(leaves), *scenarios)
             c, passive = devices.compute(_trials, ready, batch, seeds, task=task)

@@ -68,10 +68,8 @@ def _lean(scenarios: Scenario) -> Scenario:
 def _chunks(scenarios: Scenario, keys: jax.Array, size: int) -> Iterator[tuple]:
     """Equal pieces of at most ``size``, the last one filled up with copies of the last rollout."""
     n = len(keys)
-    pieces = -(-n // size)
-    size = -(-n // pieces)
-    for start in range(0, n, size):
-        index = np.minimum(np.arange(start, start + size), n - 1)
+    count = -(-n // size)
+    for index in devices.pieces(n, -(-n // count)):
         yield jax.tree.map(lambda leaf, at=index: leaf[at], (scenarios, keys))
 
 
