@@ -125,9 +125,8 @@ def trial_run(
     run = rollout(scenario, controller, key, **_of_task(task))
     passive = jnp.abs(run.u_command[:, 1 - task.joint])
     if scenario.resets is not None:
-        passive = jnp.where(
-            held(scenario.resets, np.arange(len(passive))).any(axis=-1), 0.0, passive
-        )
+        pushed = held(scenario.resets, np.arange(len(passive))).any(axis=-1)
+        passive = jnp.where(pushed, 0.0, passive)
     return run, task.criteria(run, scenario.plant), passive.max()
 
 
@@ -192,14 +191,8 @@ def official(controller: Controller, judged_on: Board | str) -> dict[str, Any]:
         spread = float(scores.std(ddof=1))
         error = 1.96 * spread / count**0.5
         interval = [mean - error, mean + error]
-    names = [name for name in vars(c) if name != "success"]
-    return {
-        "robot": task.robot,
-        "score": mean,
-        "success": bool(c.success.mean() > 0.5),
-        "diverged": bool(c.diverged.any()),
-        "criteria": {name: float(getattr(c, name).mean()) for name in names},
-        "draws": {"count": count, "std": spread, "interval": interval},
+    return _plain(c, scores, task) | {
+        "draws": {"count": count, "std": spread, "interval": interval}
     }
 
 
@@ -218,7 +211,7 @@ def official_run(
         ready = _ready(controller, task)
         run, c, passive = trial_run(ready, judged_on.drawn(seed), task, seed)
         _refuse_passive(float(passive), task)
-        return run, _plain(c, task)
+        return run, _plain(c, task.score(c), task)
 
 
 def _refuse_passive(torque: float, task: Task) -> None:
@@ -285,18 +278,20 @@ def recorded(run: Trajectory, judged_on: Board | str, *, regular: bool = True) -
     with jax.enable_x64(True):
         # As arrays: of lists, jax would take every number for an argument of its own.
         arrays = Trajectory(t - began, x, u, x, u)  # type: ignore[arg-type]
-        return _plain(_criteria(in_default(arrays), task), task)
+        c = _criteria(in_default(arrays), task)
+        return _plain(c, task.score(c), task)
 
 
-def _plain(c: Criteria, task: Task) -> dict[str, Any]:
-    """Score, success and criteria as plain numbers."""
-    names = [name for name in vars(c) if name != "success"]
+def _plain(c: Criteria, scores: Any, task: Task) -> dict[str, Any]:
+    """Score, success and criteria of a run, or the means of several, as plain numbers."""
+    found = {name: np.asarray(values).mean() for name, values in vars(c).items()}
+    success = found.pop("success")
     return {
         "robot": task.robot,
-        "score": float(task.score(c)),
-        "success": bool(c.success),
-        "diverged": bool(c.diverged),
-        "criteria": {name: float(getattr(c, name)) for name in names},
+        "score": float(np.asarray(scores).mean()),
+        "success": bool(success > 0.5),
+        "diverged": bool(np.asarray(c.diverged).any()),
+        "criteria": {name: float(value) for name, value in found.items()},
     }
 
 
