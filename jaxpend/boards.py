@@ -14,12 +14,7 @@ import numpy as np
 
 from . import designs
 from .controller import robot_of
-from .criteria import (
-    V2_HARDWARE,
-    V2_OFFICIAL,
-    ScoreV2,
-    ScoreV3,
-)
+from .criteria import V2_HARDWARE, V2_OFFICIAL, ScoreV2, ScoreV3
 from .errors import JaxpendError, choose
 from .hardware import PRESETS
 from .plant import Plant

@@ -90,10 +90,10 @@ def draw(
     Pushes end 2 s before the end of a run of ``duration`` s, so that it can stand after them; one
     shorter than 10 s has them, and that time, as much closer. Delays are in steps of ``dt`` s.
     """
-    keys = dict(zip(("plant", "rest", "pulses"), jax.random.split(key, 3), strict=True))
-    parts = jax.random.uniform(keys["plant"], (6, 2), minval=-1.0, maxval=1.0)
+    key_plant, key_rest, key_pulses = jax.random.split(key, 3)
+    parts = jax.random.uniform(key_plant, (6, 2), minval=-1.0, maxval=1.0)
     mass, com, length, inertia, damping, coulomb = parts
-    rest = jax.random.uniform(keys["rest"], (7,))
+    rest = jax.random.uniform(key_rest, (7,))
     friction = jnp.zeros(2) if plant.coulomb_friction is None else plant.coulomb_friction
     motor = 1 + spread.friction * (2 * rest[0] - 1)
     # Of the inertia, that about the centre of mass is off, and never negative: no body's is. That
@@ -114,7 +114,7 @@ def draw(
     angle, speed = spread.angle_noise * rest[1], spread.velocity_noise * rest[2]
     share = min(1.0, duration / DURATION)
     pulses = random_pulses(
-        keys["pulses"],
+        key_pulses,
         duration=duration - 2.0 * share,
         per_joint=spread.pushes,
         distance=share,

@@ -24,12 +24,8 @@ __all__ = [
 
 HOLD = 0.2  # s, that a reset lasts, and up to one step more
 JITTER = 1.0  # s, to either side, of the times that resets begin at
-PROPORTIONAL, INTEGRAL, DERIVATIVE, STEP = (
-    10.0,
-    0.1,
-    1.0,
-    0.001,
-)  # N m/rad, N m/(rad s), N m s/rad; s
+PROPORTIONAL, INTEGRAL, DERIVATIVE = 10.0, 0.1, 1.0  # N m/rad, N m/(rad s), N m s/rad
+STEP = 0.001  # s
 LIMIT = 6.0  # N m, of the PID law; gravity compensation comes on top
 # How often each joint is 0, 1 and 2 turns off in ``thrown``.
 TURNS = ((0.95, 0.05, 0.0), (0.6, 0.35, 0.05))
@@ -118,8 +114,7 @@ def stamps(dt: float, duration: float) -> tuple[np.ndarray, np.ndarray]:
 
     Both come from running float64 sums of ``dt``, as in the reference: 100 or 101 at 0.002 s.
     """
-    t = np.cumsum(np.full(int(duration / dt) + 2, dt))
-    t = np.concatenate([[0.0], t])
+    t = np.concatenate([[0.0], np.cumsum(np.full(int(duration / dt) + 2, dt))])
     taken = np.diff(t, prepend=0.0)
     longest = int(HOLD / dt) + 3
     taken = np.concatenate([taken, np.full(longest, dt)])

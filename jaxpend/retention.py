@@ -62,11 +62,10 @@ def retained(policy: Policy, after: float, task: Task) -> Retained:
     key_scenarios, key_runs = jax.random.split(jax.random.key(SHOWN_SEED))
     scenarios = jax.vmap(task.sample)(jax.random.split(key_scenarios, SHOWN))
     first = round(after / task.dt)
-    times = np.arange(first, round(task.duration / task.dt), max(round(EVERY / task.dt), 1))
+    times = np.arange(first, task.steps, max(round(EVERY / task.dt), 1))
 
     def one(scenario, key):
-        options: dict[str, Any] = {"dt": task.dt, "duration": task.duration}
-        run = rollout(scenario, policy, key, **options)
+        run = rollout(scenario, policy, key, dt=task.dt, duration=task.duration)
         counts = jnp.broadcast_to(task.stands(run.x, scenario.plant.length), times.shape)
         return seen(policy, run, key)[times], counts
 

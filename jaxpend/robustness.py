@@ -93,7 +93,6 @@ def _base(nominal: Scenario, strips: Iterable[Strip]) -> Scenario:
     One program for all that draws something and one for all else: what the absent imperfections
     cost a run is little beside what six programs cost to compile.
     """
-
     varied = {VARIATIONS[strip.variation].field for strip in strips}
     return with_neutral(nominal, varied)
 

@@ -65,10 +65,9 @@ def draws(scenario: Scenario, key, normals, steps: int, dtype) -> dict[str, jax.
         if (shape := jnp.shape(normals)) != (steps, 10):
             raise JaxpendError(f"normals have shape {shape}; they must be ({steps}, 10)")
         return found | {n: jnp.asarray(normals, dtype)[:, slice(*NOISE[n])] for n in noisy}
-    keys = dict(zip(NOISE, noise_keys, strict=True))
-    columns = {name: NOISE[name][1] - NOISE[name][0] for name in noisy}
-    for name in noisy:
-        found[name] = jax.random.normal(keys[name], (steps, columns[name]), dtype)
+    for (name, (first, end)), noise_key in zip(NOISE.items(), noise_keys, strict=True):
+        if name in noisy:
+            found[name] = jax.random.normal(noise_key, (steps, end - first), dtype)
     return found
 
 

@@ -123,8 +123,8 @@ class Task:
 
     def sample(self, key: jax.Array, share: float = 1.0) -> Scenario:
         """A trial with random imperfections, in a ``share`` of cases; ``key`` is consumed."""
-        options = {"dt": self.dt, "duration": self.duration}
-        return self._thrown(self.imperfect(self.plant, key, share, **options), key)
+        scenario = self.imperfect(self.plant, key, share, dt=self.dt, duration=self.duration)
+        return self._thrown(scenario, key)
 
     def imperfect(
         self,
@@ -178,8 +178,7 @@ class Task:
     def criteria(self, run: Trajectory, plant: Plant | None = None) -> Criteria:
         """The criteria of a trajectory; ``plant`` gives the link lengths, by default the task's."""
         plant = self.plant if plant is None else plant
-        options = {"height": self.height, "t_final": self.duration}
-        return criteria(run.t, run.x, run.u, plant, **options)
+        return criteria(run.t, run.x, run.u, plant, height=self.height, t_final=self.duration)
 
     def score(self, c: Criteria) -> jax.Array:
         """The score of criteria, of their batch shape."""
