@@ -14,17 +14,9 @@ if TYPE_CHECKING:
     from .scenario import Pulses, Scenario
 
 __all__ = [
-    "JaxpendError",
-    "Plant",
-    "Policy",
-    "Pulses",
-    "Scenario",
-    "Trajectory",
-    "final_state",
-    "load_policy",
-    "rollout",
-    "save_policy",
-]
+    "JaxpendError", "Plant", "Policy", "Pulses", "Scenario", "Trajectory", "final_state",
+    "load_policy", "rollout", "save_policy",
+]  # fmt: skip
 __version__ = "0.13.0"
 
 _HOME = {

@@ -36,18 +36,9 @@ from .task import Task
 from .trigonometry import sincos
 
 __all__ = [
-    "LINES",
-    "Env",
-    "EnvConfig",
-    "EnvState",
-    "Reward",
-    "World",
-    "anywhere",
-    "restarted",
-    "surrogate_reward",
-    "thrown_states",
-    "truncated",
-]
+    "LINES", "Env", "EnvConfig", "EnvState", "Reward", "World", "anywhere", "restarted",
+    "surrogate_reward", "thrown_states", "truncated",
+]  # fmt: skip
 
 T = TypeVar("T")
 

@@ -23,31 +23,10 @@ from typing import Annotated, Any, Literal
 from .errors import JaxpendError
 
 __all__ = [
-    "LARGEST",
-    "OFF",
-    "ON",
-    "SLOWEST",
-    "BoardName",
-    "Bounds",
-    "Checked",
-    "Count",
-    "Duration",
-    "Natural",
-    "NotNegative",
-    "Period",
-    "Positive",
-    "PositiveOrInfinite",
-    "Preset",
-    "Rate",
-    "Robot",
-    "Scale",
-    "Seed",
-    "Share",
-    "checked",
-    "described",
-    "hints_of",
-    "split",
-]
+    "LARGEST", "OFF", "ON", "SLOWEST", "BoardName", "Bounds", "Checked", "Count", "Duration",
+    "Natural", "NotNegative", "Period", "Positive", "PositiveOrInfinite", "Preset", "Rate", "Robot",
+    "Scale", "Seed", "Share", "checked", "described", "hints_of", "split",
+]  # fmt: skip
 
 LARGEST = 2**31 - 1  # of an integer: what is counted on a device is counted in 32 bits
 OFF = ("off", "no", "false", "0")

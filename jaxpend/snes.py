@@ -31,14 +31,7 @@ from .stage import Candidates, Chart, Row, SearchStage, SearchState
 from .task import Task
 
 __all__ = [
-    "SNES",
-    "STRATEGIES",
-    "SNESConfig",
-    "SNESState",
-    "best_controller",
-    "evolve",
-    "fitness",
-    "init",
+    "SNES", "STRATEGIES", "SNESConfig", "SNESState", "best_controller", "evolve", "fitness", "init",
     "mean_controller",
 ]  # fmt: skip
 

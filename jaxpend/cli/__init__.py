@@ -6,13 +6,6 @@ from .options import parse
 from .output import emit_json
 
 __all__ = [
-    "COMMANDS",
-    "Command",
-    "compile_cache",
-    "emit_json",
-    "function_of",
-    "main",
-    "one_sentence",
-    "parse",
-    "run",
-]
+    "COMMANDS", "Command", "compile_cache", "emit_json", "function_of", "main", "one_sentence",
+    "parse", "run",
+]  # fmt: skip

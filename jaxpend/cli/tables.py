@@ -15,14 +15,9 @@ if TYPE_CHECKING:
     from ..identification import Identified
 
 __all__ = [
-    "hardware_table",
-    "identified_table",
-    "leaderboard_table",
-    "robustness_table",
-    "runs_table",
-    "score_table",
-    "seeds_table",
-]
+    "hardware_table", "identified_table", "leaderboard_table", "robustness_table", "runs_table",
+    "score_table", "seeds_table",
+]  # fmt: skip
 
 HEADINGS_OF_RUNS = ("run", "robot", "stages", "seed", "state", "score", "time", "date")
 COLOURS = {"finished": "green", "running": "cyan", "interrupted": "yellow", "broken": "red"}

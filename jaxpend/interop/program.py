@@ -21,16 +21,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = [
-    "KINDS",
-    "Builder",
-    "Leaf",
-    "Node",
-    "Program",
-    "is_constant",
-    "is_range",
-    "named",
-]
+__all__ = ["KINDS", "Builder", "Leaf", "Node", "Program", "is_constant", "is_range", "named"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

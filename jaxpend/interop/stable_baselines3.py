@@ -27,14 +27,8 @@ from ..robots import ROBOTS
 from .tensors import MOST_PICKLE, MOST_TENSORS, Name, StateDict, array, description, member, shown
 
 __all__ = [
-    "PRESETS",
-    "Convention",
-    "Model",
-    "Statistics",
-    "declared",
-    "read_model",
-    "read_statistics",
-]
+    "PRESETS", "Convention", "Model", "Statistics", "declared", "read_model", "read_statistics",
+]  # fmt: skip
 
 # What an environment may show: a kind of ``Observation``, and where each of its entries is there.
 SEEN: dict[str, tuple[str, tuple[int, ...] | None]] = {

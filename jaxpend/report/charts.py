@@ -9,13 +9,8 @@ from ..runs.statistics import interquartile_mean, interval
 from .figures import PALETTE
 
 __all__ = [
-    "draw_angles",
-    "draw_curves",
-    "draw_height",
-    "draw_phase",
-    "draw_torque",
-    "draw_velocities",
-]
+    "draw_angles", "draw_curves", "draw_height", "draw_phase", "draw_torque", "draw_velocities",
+]  # fmt: skip
 
 # --- a swing-up ----------------------------------------------------------------------------
 

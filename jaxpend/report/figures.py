@@ -25,19 +25,9 @@ from ..fleet import CONDITIONS
 from ..variations import VARIATIONS, Variation
 
 __all__ = [
-    "PALETTE",
-    "UNITS",
-    "along",
-    "map_figure",
-    "panel",
-    "robustness_figure",
-    "save",
-    "stack",
-    "strips_figure",
-    "svg",
-    "write_hardware",
-    "write_robustness",
-]
+    "PALETTE", "UNITS", "along", "map_figure", "panel", "robustness_figure", "save", "stack",
+    "strips_figure", "svg", "write_hardware", "write_robustness",
+]  # fmt: skip
 
 # Okabe and Ito's colours, told apart by eyes of every kind. A page puts its own in their place
 # (``svg``), by these names, so that it can be light or dark.

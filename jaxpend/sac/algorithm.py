@@ -25,20 +25,9 @@ from .networks import Actor, Params, act, constant_log_std, distribution, squash
 from .replay import Replay, Transition
 
 __all__ = [
-    "Agent",
-    "SACState",
-    "begin",
-    "greedy_policy",
-    "imitate_chunk",
-    "init",
-    "interact",
-    "sample",
-    "structure",
-    "train_chunk",
-    "train_chunks",
-    "update",
-    "with_actor",
-]
+    "Agent", "SACState", "begin", "greedy_policy", "imitate_chunk", "init", "interact", "sample",
+    "structure", "train_chunk", "train_chunks", "update", "with_actor",
+]  # fmt: skip
 
 Metrics = dict[str, jax.Array]
 
