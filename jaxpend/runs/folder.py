@@ -111,6 +111,7 @@ class RunFolder(contextlib.AbstractContextManager):
         self, path: str | Path, config: Any, command: str, about: Mapping[str, Any] | None = None
     ):
         self.path, self.command, self.about = Path(path), command, about or {}
+        self._metrics = self.path / "metrics.jsonl"
         self._tensorboard = getattr(config, "tensorboard", False)
         self._events: tensorboard.Events | None = None
         if self._tensorboard:
@@ -173,14 +174,13 @@ class RunFolder(contextlib.AbstractContextManager):
     def rewind(self, metrics_bytes: int = 0, seconds: float = 0.0) -> None:
         """Go back to when the metrics were this long, after so much time."""
         self.started = time.perf_counter() - seconds
-        if (self.path / "metrics.jsonl").exists():
-            os.truncate(self.path / "metrics.jsonl", metrics_bytes)
+        if self._metrics.exists():
+            os.truncate(self._metrics, metrics_bytes)
 
     @property
     def metrics_bytes(self) -> int:
         """Length of the metrics on disk."""
-        path = self.path / "metrics.jsonl"
-        return path.stat().st_size if path.exists() else 0
+        return self._metrics.stat().st_size if self._metrics.exists() else 0
 
     def write_json(self, name: str, value: Any) -> None:
         """Write a JSON file."""
@@ -193,11 +193,11 @@ class RunFolder(contextlib.AbstractContextManager):
         self.check_there()
         before = self.metrics_bytes
         try:
-            with (self.path / "metrics.jsonl").open("a") as file:
+            with self._metrics.open("a") as file:
                 file.write(to_json(row) + "\n")
         except OSError:  # a full disk takes the beginning of a row
             if self.metrics_bytes > before:
-                os.truncate(self.path / "metrics.jsonl", before)
+                os.truncate(self._metrics, before)
             raise
         if self._events is not None:
             self._events.add(row)
