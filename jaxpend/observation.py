@@ -106,8 +106,7 @@ class Observation(Checked):
             raise JaxpendError(f"history is 0; {text}; it must be at least 1")
         for name in ("mean", "std", "clip"):
             if self.kind == "angles" and (value := getattr(self, name)) is not None:
-                text = "angles are not normalised; leave it out"
-                raise JaxpendError(f"{name} is {value}; {text}")
+                raise JaxpendError(f"{name} is {value}; angles are not normalised; leave it out")
         for name in ("mean", "std"):
             value = getattr(self, name)
             if value is not None and len(value) != self.state_size:

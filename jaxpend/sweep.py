@@ -77,8 +77,7 @@ def _rows(scenarios: Scenario) -> int:
     """How many scenarios a batch holds. Raises ``JaxpendError`` for what is no batch."""
     if not isinstance(scenarios, Scenario) or np.ndim(scenarios.plant.mass) != 2:
         what = type(scenarios).__name__
-        text = f"{what} is no batch of scenarios; vary(Scenario(plant), ...) makes one"
-        raise JaxpendError(text)
+        raise JaxpendError(f"{what} is no batch of scenarios; vary(Scenario(plant), ...) makes one")
     sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(scenarios)}
     if len(sizes) > 1:
         text = f"the parts of the batch have leading axes {sorted(sizes)}; they must be the same"

@@ -40,15 +40,12 @@ def load_csv(path: str | Path) -> Trajectory:
     names = [name.strip() for name in rows[0]] if rows else []
     if not names:
         raise JaxpendError(f"{path} is empty; it must have the columns {HEADER}")
-    lacking = min(
-        ([name for name in ("time", *kind) if name not in names] for kind in (MEASURED, PLANNED)),
-        key=len,
-    )
-    if lacking:
+    lacking = {kind: [n for n in ("time", *kind) if n not in names] for kind in (MEASURED, PLANNED)}
+    kind = min(lacking, key=lambda kind: len(lacking[kind]))
+    if lacking[kind]:
         raise JaxpendError(
-            f"{path} has no column {', '.join(lacking)}; it must have the columns {HEADER}"
+            f"{path} has no column {', '.join(lacking[kind])}; it must have the columns {HEADER}"
         )
-    kind = MEASURED if all(name in names for name in MEASURED) else PLANNED
     if twice := [name for name in ("time", *kind) if names.count(name) > 1]:
         raise JaxpendError(f"{path} has the column {twice[0]} twice; which one counts is not clear")
     columns = [names.index(name) for name in ("time", *kind)]
