@@ -17,7 +17,7 @@ __all__ = [
     "JaxpendError", "Plant", "Policy", "Pulses", "Scenario", "Trajectory", "final_state",
     "load_policy", "rollout", "save_policy",
 ]  # fmt: skip
-__version__ = "0.13.0"
+__version__ = "0.14.0"
 
 _HOME = {
     "JaxpendError": ".errors",

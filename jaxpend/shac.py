@@ -4,7 +4,8 @@ SHAC (Xu et al., "Accelerated policy learning with parallel differentiable simul
 2204.07137) for the v3 board, whose score is the share of a minute that the tip is above the line.
 The closed loop is differentiated from end to end, as in ``gradient``, but through a minute with
 fifteen throws there is no gradient that means anything. Therefore many arms live side by side. In
-a step each of them moves on by a window of T seconds, and Adam climbs the mean over all arms of
+a step each of them moves on by a window of T seconds, and the policy climbs the mean over all arms
+of
 
     1 / h  integral from 0 to T of exp(-t / h) up(x(t)) dt  +  exp(-T / h) V(x(T))
 
@@ -12,9 +13,16 @@ with ``up`` in [0, 1] a smooth form of "above the line", h the horizon, and V a 
 comes after the window: how much of the time, discounted likewise, the arm will be up. The critic
 learns by TD(lambda) from the same windows. Then the arms are kicked a little, and some are thrown,
 or put anywhere.
+
+It climbs along the natural gradient (Kakade, "A natural policy gradient", 2001): of all steps that
+change the actions as much, in the states of the windows, the one that gains most. Some directions
+in the weights change what the arm does a thousand times as much as others, and Adam, whose steps
+are of one size in every weight, either loses the arm along the first or stands still along the
+others. A step is tried in the same windows before it is taken, whole or in part.
 """
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Self
 
@@ -29,7 +37,7 @@ from .boards import own_task
 from .config import Run, SHACConfig
 from .controller import Controller, check_controller
 from .controllers.policy import Policy
-from .controllers.search_space import coordinates
+from .controllers.search_space import Rebuild, coordinates
 from .env import anywhere
 from .errors import JaxpendError
 from .plant import UPRIGHT, tip_height
@@ -46,7 +54,12 @@ __all__ = ["SHAC", "SHACConfig", "SHACState", "current", "improve", "init"]
 
 FASTEST = 60.0  # rad/s; an arm that is faster is put elsewhere
 LEARNED = 25  # times of a window that the critic learns at
-WARM_UP = 40  # steps of the actor, in which their size grows
+LOOKED_AT = 12  # times of a window at which a change of the actions is measured
+WARM_UP = 20  # steps of the actor, in which their size grows
+SMOOTHED = 0.1  # how fast the mean of the gradients, along which a step leads, takes up a new one
+DAMPING = 0.01  # mean squared change of the actions that a weight's change of 1 counts like
+ITERATIONS = 10  # of the conjugate gradients
+TRIED = (1.0, 0.5, 0.25)  # parts of a step; the best of them is taken
 
 
 @pytree
@@ -54,7 +67,7 @@ class SHACState(Pytree):
     """Everything that the ascent changes."""
 
     parameters: jax.Array  # (parameters,)
-    optimizer: Any  # optax state
+    slope: jax.Array  # (parameters,) mean of the gradients so far, of the last ones above all
     critic: Params
     target: Params  # of the critic, following slowly
     critic_opt: Any  # optax state
@@ -131,11 +144,36 @@ def targets(config: SHACConfig, critic: Params, x: jax.Array, task: Task) -> jax
     return jax.lax.scan(back, values[-1], steps, reverse=True)[1]
 
 
-def _adam(config: SHACConfig) -> optax.GradientTransformation:
-    """Of the actor, whose steps alone it counts: warmed up, then with cosine decay."""
-    rate, steps = config.learning_rate, max(config.steps - config.critic_steps, 2)
-    last, warm_up = config.final_learning_rate * rate, min(WARM_UP, steps - 1)
-    return optax.adam(optax.warmup_cosine_decay_schedule(0.0, rate, warm_up, steps, last))
+def natural(policy: Rebuild, z: jax.Array, slope: jax.Array, x: jax.Array) -> jax.Array:
+    """The step (parameters,) that climbs most, of those that change the actions by 1.
+
+    That is F^-1 g to scale, with g the ``slope`` and z' F z the mean square of what a step z
+    changes in the actions in [-1, 1] in the states ``x`` (n, 4), to first order, and a little of
+    the step's own square. The equation is solved by conjugate gradients, as in TRPO (Schulman et
+    al., 2015).
+    """
+
+    def actions(z: jax.Array) -> jax.Array:
+        at: Any = policy(z)
+        return jax.vmap(lambda x: at.greedy(at.observation(x, None)))(x)
+
+    _, change = jax.linearize(actions, z)
+    back = jax.linear_transpose(change, z)
+
+    def metric(step: jax.Array) -> jax.Array:
+        return back(change(step))[0] / len(x) + DAMPING * step
+
+    step, _ = jax.scipy.sparse.linalg.cg(metric, slope, maxiter=ITERATIONS)
+    size = jnp.sqrt(jnp.maximum(step @ metric(step), 0.0))
+    return step / jnp.where(size > 0, size, 1.0)
+
+
+def _trust(config: SHACConfig, own: jax.Array) -> jax.Array:
+    """How far the actor goes after so many steps of its own: warmed up, then with cosine decay."""
+    last, steps = config.final_trust * config.trust, max(config.steps - config.critic_steps, 2)
+    ramp = min(WARM_UP, steps - 1)
+    found: Any = optax.warmup_cosine_decay_schedule(0.0, config.trust, ramp, steps, last)(own + 1)
+    return found
 
 
 def _critic_adam(config: SHACConfig) -> optax.GradientTransformation:
@@ -173,9 +211,8 @@ def init(
         jax.random.split(key_x, config.num_arms)
     )
     zero = jnp.zeros((), jnp.int32)
-    memories = _adam(config).init(z), _critic_adam(config).init(critic)
-    target = jax.tree.map(jnp.copy, critic)
-    return SHACState(z, memories[0], critic, target, memories[1], x, key, zero, zero)
+    memory, target = _critic_adam(config).init(critic), jax.tree.map(jnp.copy, critic)
+    return SHACState(z, jnp.zeros_like(z), critic, target, memory, x, key, zero, zero)
 
 
 def _thrown(task: Task, x: jax.Array, key: jax.Array) -> jax.Array:
@@ -229,6 +266,26 @@ def _learn(
     return state.replace(critic=critic, critic_opt=memory, target=target), errors.mean()
 
 
+def _climb(
+    config: SHACConfig, rebuild: Rebuild, state: SHACState, slope: jax.Array, x: jax.Array,
+    gained: Callable[[jax.Array], jax.Array],
+) -> SHACState:  # fmt: skip
+    """After a step of the policy, given the slope and the windows ``x`` (num_arms, T + 1, 4).
+
+    ``gained`` says how much more than now other parameters are worth, (), in the same windows.
+    """
+    z, own = state.parameters, state.steps - config.critic_steps
+    slope = optax.incremental_update(slope, state.slope, SMOOTHED)
+    x = x[:, :: max((x.shape[1] - 1) // LOOKED_AT, 1)].reshape(-1, 4)
+    step = natural(rebuild, z, slope, jnp.where(jnp.isfinite(x), x, 0.0))
+    step = _trust(config, own) * step
+    # Where it bends more than the slope can say, a part of the step is right, or nothing of it.
+    parts = jnp.array(TRIED, z.dtype)
+    gains = jax.lax.map(lambda part: gained(z + part * step), parts)
+    z = z + jnp.where(gains.max() > 0, parts[gains.argmax()], 0.0) * step
+    return state.replace(parameters=z, slope=slope)
+
+
 @partial(jax.jit, static_argnames=("config", "steps", "task"))
 def improve(
     config: SHACConfig,
@@ -243,7 +300,7 @@ def improve(
     alone.
     """
     task = own_task(start, task)
-    adam = _adam(config)
+    rebuild: Rebuild = coordinates(start, config.searched)[-1]
 
     def each(z: jax.Array, start: Any, critic: Params, x: jax.Array, key: jax.Array):
         policy: Any = coordinates(start, config.searched)[-1](z)
@@ -251,11 +308,13 @@ def improve(
         met = window(config, task, x, key_met)
         return ahead(config, policy.replace(action_noise=None), critic, met, key, task)
 
-    windows = jax.vmap(jax.value_and_grad(each, has_aux=True), in_axes=(None, None, None, 0, 0))
+    axes = (None, None, None, 0, 0)
+    windows = jax.vmap(jax.value_and_grad(each, has_aux=True), in_axes=axes)
+    values = jax.vmap(lambda *args: each(*args)[0], in_axes=axes)
 
     def step(state: SHACState, _: None) -> tuple[SHACState, dict[str, jax.Array]]:
         key, key_critic, key_arms, key_windows = jax.random.split(state.key, 4)
-        z, common = state.parameters, (state.parameters, start, state.target)
+        common = state.parameters, start, state.target
         keys = jax.random.split(key_windows, config.num_arms)
         (worth, x), slopes = devices.split(windows, *common)(state.x, keys)
         norm = jnp.linalg.norm(slopes, axis=1)
@@ -263,17 +322,18 @@ def improve(
         scale = jnp.minimum(1.0, config.clip / jnp.where(norm > 0, norm, 1.0))
         slopes = jnp.where(usable[:, None], scale[:, None] * slopes, 0.0)
         slope = slopes.sum(axis=0) / jnp.maximum(usable.sum(), 1)
-        move, memory = adam.update(-slope, state.optimizer)
-        acts = state.steps >= config.critic_steps
-        after = optax.apply_updates(z, move), memory
-        z, memory = jax.tree.map(partial(jnp.where, acts), after, (z, state.optimizer))
+
+        def gained(z: jax.Array) -> jax.Array:
+            found = devices.split(values, z, *common[1:])(state.x, keys) - worth
+            return jnp.where(jnp.isfinite(found), found, 0.0).sum()
+
+        climb = partial(_climb, config, rebuild, state, slope, x, gained)
+        state = jax.lax.cond(state.steps >= config.critic_steps, climb, lambda: state)
         state, loss = _learn(config, state, x, key_critic, task)
         keys = jax.random.split(key_arms, config.num_arms)
         arms = jax.vmap(partial(elsewhere, config, task))(x[:, -1], keys)
         lost = state.lost + jnp.sum(~usable, dtype=jnp.int32)
-        state = state.replace(
-            parameters=z, optimizer=memory, x=arms, key=key, steps=state.steps + 1, lost=lost
-        )
+        state = state.replace(x=arms, key=key, steps=state.steps + 1, lost=lost)
         metrics = {"up": jnp.nanmean(up(config, task, x)), "critic_loss": loss}
         return state, metrics | {"slope": jnp.linalg.norm(slope)}
 

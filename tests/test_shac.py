@@ -25,7 +25,7 @@ from jaxpend.train.loop import stages_of
 
 TASK = v3("pendubot").task
 SMALL = SHACConfig(
-    steps=8, critic_steps=2, num_arms=4, window=0.08, critic_hidden=(8,), critic_updates=2, chunk=3
+    steps=9, critic_steps=2, num_arms=4, window=0.08, critic_hidden=(8,), critic_updates=2, chunk=3
 )
 POLICY = load_policy("global_pendubot")
 KEY = jax.random.key(0)
@@ -94,19 +94,6 @@ def test_the_worth_of_a_window_and_the_targets_are_discounted_sums():
         np.testing.assert_allclose(found[t], wanted, rtol=1e-9)
 
 
-def test_the_critic_learns_alone_first_and_then_the_policy():
-    config = dataclasses.replace(SMALL, steps=80, critic_steps=60, num_arms=16)
-    start = init(config, POLICY, KEY, TASK)
-    alone, metrics = improve(config, POLICY, start, 60, TASK)
-    losses = np.asarray(metrics["critic_loss"])
-    assert losses[-10:].mean() < 0.3 * losses[:3].mean()
-    np.testing.assert_array_equal(alone.parameters, start.parameters)
-    assert not np.array_equal(alone.x, start.x)
-    after, _ = improve(config, POLICY, alone, 20, TASK)
-    assert (np.asarray(after.parameters) != np.asarray(start.parameters)).mean() > 0.5
-    assert int(after.steps) == 80
-
-
 def test_arms_are_thrown_and_put_anywhere_and_never_lost(monkeypatch):
     marked = jnp.array([1.0, 2.0, 3.0, 4.0])
     monkeypatch.setattr(shac, "_thrown", lambda task, x, key: marked)
@@ -133,18 +120,61 @@ def test_some_windows_are_in_random_scenarios_with_delays_in_steps_of_the_window
     delay = np.asarray(met.delay)[:, 0]
     assert (delay > 0).mean() == pytest.approx(0.5 / 6, abs=0.03)
     assert delay.max() == 10  # 40 ms in steps of 4 ms
-    state = init(config, POLICY, KEY, TASK)
-    after, metrics = improve(config, POLICY, state, 4, TASK)
-    assert np.isfinite(metrics["slope"]).all()
-    assert not np.array_equal(after.parameters, state.parameters)
 
 
-def test_it_learns_what_a_policy_has_lost():
+@pytest.mark.x64
+def test_the_step_is_the_natural_gradient():
+    """Against the equation with the whole matrix, which few parameters allow."""
+    kernel, bias = jax.random.normal(KEY, (POLICY.observation.size, 1)), jnp.zeros(1)
+    policy = in_default(POLICY).replace(layers=((0.3 * kernel, bias),))
+    z, _, rebuild = coordinates(policy)
+    assert len(z) <= shac.ITERATIONS
+    slope = jax.random.normal(jax.random.key(1), z.shape)
+    x = jax.random.normal(jax.random.key(2), (300, 4)) * jnp.array([2.0, 2.0, 5.0, 5.0])
+
+    def actions(z):
+        return jax.vmap(lambda x: rebuild(z)((None, None), 0.0, x)[1].sum())(x) / 6.0
+
+    jacobian = np.asarray(jax.jacobian(actions)(z))
+    matrix = jacobian.T @ jacobian / len(x) + shac.DAMPING * np.eye(len(z))
+    wanted = np.linalg.solve(matrix, slope)
+    wanted /= np.sqrt(wanted @ matrix @ wanted)
+    found = shac.natural(rebuild, z, slope, x)
+    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-6)
+    assert slope @ found > 0
+    assert np.isfinite(shac.natural(rebuild, z, 0 * slope, x)).all()
+
+
+@pytest.mark.parametrize(
+    ("gained", "taken"),
+    [
+        (lambda size: size, 1.0),  # the further the better
+        (lambda size: 1 - abs(size - 0.5), 0.5),
+        (lambda size: 1 - abs(size - 0.2), 0.25),
+        (lambda size: -size, 0.0),  # worse everywhere
+        (lambda size: jnp.nan * size, 0.0),
+    ],
+)
+def test_of_a_step_the_part_is_taken_that_gains_most(gained, taken):
+    config = dataclasses.replace(SMALL, trust=0.02)
+    z, _, rebuild = coordinates(POLICY)
+    state = init(config, POLICY, KEY, TASK).replace(steps=jnp.asarray(5))
+    slope, x = jax.random.normal(KEY, z.shape), jnp.zeros((4, 21, 4))
+    whole = shac._trust(config, jnp.asarray(3)) * shac.natural(rebuild, z, slope, x[:, 0])
+
+    def worth(other):
+        return gained(jnp.linalg.norm(other - z) / jnp.linalg.norm(whole))
+
+    after = shac._climb(config, rebuild, state, slope, x, worth).parameters
+    np.testing.assert_allclose(after - z, taken * whole, rtol=1e-2, atol=1e-6)
+
+
+def test_the_critic_learns_alone_first_and_then_what_a_policy_has_lost():
     """A policy that has become timid stands up sooner after some steps."""
     *hidden, (kernel, bias) = POLICY.layers
-    timid = POLICY.replace(layers=(*hidden, (0.3 * kernel, 0.3 * bias)))
-    config = SHACConfig(steps=200, critic_steps=60, num_arms=48, dt=0.01, learning_rate=1e-3)
-    state = init(config, timid, KEY, TASK)
+    timid = POLICY.replace(layers=(*hidden, (0.5 * kernel, 0.5 * bias)))
+    config = SHACConfig(steps=180, critic_steps=60, num_arms=48, dt=0.01, trust=0.03)
+    start = init(config, timid, KEY, TASK)
     keys = jax.random.split(jax.random.key(1), 256)
     x = jax.vmap(partial(shac._thrown, TASK, jnp.array(UPRIGHT)))(keys)
 
@@ -156,26 +186,36 @@ def test_it_learns_what_a_policy_has_lost():
 
         return up(config, TASK, jax.vmap(states)(x)).mean()
 
+    alone, metrics = improve(config, timid, start, 60, TASK)
+    losses = np.asarray(metrics["critic_loss"])
+    assert losses[-10:].mean() < 0.3 * losses[:3].mean()
+    np.testing.assert_array_equal(alone.parameters, start.parameters)
+    assert not np.array_equal(alone.x, start.x)
+    state = alone
     for _ in range(2):
-        state, metrics = improve(config, timid, state, 100, TASK)
+        state, metrics = improve(config, timid, state, 60, TASK)
+        assert np.isfinite(metrics["slope"]).all()
+    assert (np.asarray(state.parameters) != np.asarray(start.parameters)).mean() > 0.5
+    assert int(state.steps) == 180
+    assert int(state.lost) == 0
     before, after = share(timid), share(shac.current(config, timid, state))
     assert after > before + 0.05
-    assert int(state.lost) == 0
-    assert np.isfinite(metrics["slope"]).all()
 
 
 def test_the_stage_goes_on_from_a_checkpoint_as_if_nothing_had_been(tmp_path):
     stages = stages_of(TrainRun(board="v3", shac=SMALL), None, TASK)
     assert list(stages) == ["sac", "shac", "snes"]
-    stage = SHAC(SMALL, POLICY, TASK)
+    stage = SHAC(dataclasses.replace(SMALL, randomised=0.5), POLICY, TASK)
     state, checkpoints = stage.start(0, POLICY), Checkpoints(tmp_path)
-    for count in (3, 6, 8):
+    for count in (3, 6, 9):
         checkpoints.save({"state": state}, {})
         ((after, metrics),) = stage.advance([state])
         read, _ = checkpoints.newest(lambda _: {"state": stage.like()})
         ((again, _),) = stage.advance([read["state"]])
         chex.assert_trees_all_equal(after, again)
         assert stage.done(after) == count
+        assert np.isfinite(metrics["slope"]).all()
+        assert not np.array_equal(after.search.parameters, state.search.parameters)
         state = after
     row, [(policy, worth)] = stage.judge(state, metrics)
     assert worth == row["score"]
@@ -202,8 +242,9 @@ def test_what_it_cannot_improve_is_refused(policy, task, words):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"steps": 800}, "steps is 800; it must be more than the 800 of critic_steps"),
+        ({"steps": 600}, "steps is 600; it must be more than the 600 of critic_steps"),
         ({"dt": 0.6}, "dt is 0.6; it must not be longer than window"),
+        ({"trust": 0.0}, "trust is 0.0"),
         ({"thrown": 0.99, "anywhere": 0.1}, "thrown and anywhere are 0.99 and 0.1"),
     ],
 )

@@ -93,14 +93,14 @@ class GradientConfig(Checked):
 class SHACConfig(Checked):
     """Hyperparameters of the short-horizon actor-critic; see ``jaxpend.shac``."""
 
-    steps: Natural = 5000  # of Adam, those of the critic alone among them; 0: no such stage
-    critic_steps: Natural = 800  # the first so many, in which the critic learns alone
+    steps: Natural = 2000  # those of the critic alone among them; 0: no such stage
+    critic_steps: Natural = 600  # the first so many, in which the critic learns alone
     num_arms: Count = 128  # that live side by side
     window: Duration = 0.5  # s, by which each of them moves on in a step
     dt: Period = 0.004  # s, control and integration period there
     horizon: Positive = 2.0  # s, in which what is to come loses a factor of e of its weight
-    learning_rate: Positive = 4e-4  # of the policy's weights
-    final_learning_rate: Positive = 0.05  # cosine decay to this fraction of learning_rate
+    trust: Positive = 0.01  # root mean square of what a step changes in the actions in [-1, 1]
+    final_trust: Positive = 0.05  # cosine decay to this fraction of trust
     clip: Positive = 1.0  # norm of the gradient of one window
     line_width: Positive = 0.02  # m, over which the line is blurred
     # rad, and in rad/s ten times as much: largest standard deviation of jumps between windows.

@@ -21,7 +21,7 @@ from jax.tree_util import keystr
 
 from ..errors import JaxpendError
 
-__all__ = ["FACTOR", "KNOTS", "OVER_TIME", "WEIGHT", "coordinates", "kinds"]
+__all__ = ["FACTOR", "KNOTS", "OVER_TIME", "WEIGHT", "Rebuild", "coordinates", "kinds"]
 
 # What ``searched`` may be besides key paths.
 WHOLE = ("all", "weights", "hidden")
