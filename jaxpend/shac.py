@@ -57,7 +57,7 @@ LEARNED = 25  # times of a window that the critic learns at
 LOOKED_AT = 12  # times of a window at which a change of the actions is measured
 WARM_UP = 20  # steps of the actor, in which their size grows
 SMOOTHED = 0.1  # how fast the mean of the gradients, along which a step leads, takes up a new one
-DAMPING = 0.01  # mean squared change of the actions that a weight's change of 1 counts like
+DAMPING = 0.01  # what the square of a step counts beside what it changes in the actions
 ITERATIONS = 10  # of the conjugate gradients
 TRIED = (1.0, 0.5, 0.25)  # parts of a step; the best of them is taken
 
@@ -144,18 +144,18 @@ def targets(config: SHACConfig, critic: Params, x: jax.Array, task: Task) -> jax
     return jax.lax.scan(back, values[-1], steps, reverse=True)[1]
 
 
-def natural(policy: Rebuild, z: jax.Array, slope: jax.Array, x: jax.Array) -> jax.Array:
-    """The step (parameters,) that climbs most, of those that change the actions by 1.
+def natural(rebuild: Rebuild, z: jax.Array, slope: jax.Array, x: jax.Array) -> jax.Array:
+    """The step (parameters,) from ``z`` that climbs most, of those that change the actions by 1.
 
-    That is F^-1 g to scale, with g the ``slope`` and z' F z the mean square of what a step z
-    changes in the actions in [-1, 1] in the states ``x`` (n, 4), to first order, and a little of
-    the step's own square. The equation is solved by conjugate gradients, as in TRPO (Schulman et
-    al., 2015).
+    That is s = F^-1 g, to scale: g is the ``slope``, and s' F s the mean square of what s changes
+    in the actions in [-1, 1] in the states ``x`` (n, 4), to first order, plus ``DAMPING`` times
+    the square of s. The equation is solved by conjugate gradients, as in TRPO (Schulman et al.,
+    2015). ``rebuild`` makes the policy of parameters.
     """
 
     def actions(z: jax.Array) -> jax.Array:
-        at: Any = policy(z)
-        return jax.vmap(lambda x: at.greedy(at.observation(x, None)))(x)
+        policy: Any = rebuild(z)
+        return jax.vmap(lambda x: policy.greedy(policy.observation(x, None)))(x)
 
     _, change = jax.linearize(actions, z)
     back = jax.linear_transpose(change, z)
